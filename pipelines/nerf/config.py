@@ -1,0 +1,151 @@
+"""Every option of the NeRF and its default, once: plain dataclasses, no torch, no pydantic.
+
+`metadata` carries what people and the API need: `help`, and where it applies `unit`, `ge`, `le`,
+`choices`. `pipelines.options` turns these classes into checked pydantic models. Defaults are the
+paper's Nerfacto as its authors ship it (nerfstudio 1.1.5); a comment gives the reason for each
+departure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+def option(default: Any, help: str, **bounds: Any) -> Any:
+    """A dataclass field with its meaning; `bounds`: unit, ge, le, choices."""
+    if isinstance(default, type):
+        return field(default_factory=default, metadata={"help": help, **bounds})
+    return field(default=default, metadata={"help": help, **bounds})
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """A multi-resolution hash grid (Instant-NGP, arXiv:2201.05989)."""
+
+    num_levels: int = option(16, "Number of resolution levels.", ge=1, le=32)
+    min_res: int = option(16, "Cells per side of the coarsest level.", ge=2, le=1024)
+    max_res: int = option(2048, "Cells per side of the finest level.", ge=2, le=65536)
+    log2_table_size: int = option(19, "log2 of the entries per level.", ge=8, le=24)
+    features_per_level: int = option(2, "Features per entry.", ge=1, le=8)
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """One proposal network: a small hash grid and a small MLP that give density."""
+
+    grid: HashGridConfig = field(
+        default_factory=lambda: HashGridConfig(
+            num_levels=5, min_res=16, max_res=128, log2_table_size=17
+        ),
+        metadata={"help": "The network's hash grid."},
+    )
+    hidden_dim: int = option(16, "Width of the one hidden layer.", ge=1, le=256)
+
+
+def _default_proposals() -> tuple[ProposalConfig, ...]:
+    return (
+        ProposalConfig(),
+        ProposalConfig(
+            grid=HashGridConfig(num_levels=5, min_res=16, max_res=256, log2_table_size=17)
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class NerfactoConfig:
+    """The model (paper, section 5; defaults of nerfstudio 1.1.5)."""
+
+    near: float = option(0.05, "Nearest sample.", unit="scene units", ge=0.0, le=10.0)
+    far: float = option(1000.0, "Farthest sample.", unit="scene units", ge=1.0, le=1e6)
+    num_proposal_samples: tuple[int, ...] = option(
+        (256, 96), "Samples per ray of each proposal round.", ge=1, le=4096
+    )
+    num_nerf_samples: int = option(48, "Samples per ray of the field.", ge=1, le=4096)
+    proposals: tuple[ProposalConfig, ...] = field(
+        default_factory=_default_proposals, metadata={"help": "The proposal networks."}
+    )
+    share_proposal_network: bool = option(False, "Use the first network in every round.")
+    grid: HashGridConfig = option(HashGridConfig, "The field's hash grid.")
+    hidden_dim: int = option(64, "Width of the density MLP.", ge=1, le=1024)
+    hidden_dim_color: int = option(64, "Width of the colour MLP.", ge=1, le=1024)
+    geo_feature_dim: int = option(15, "Features from density to colour.", ge=1, le=256)
+    appearance_dim: int = option(32, "Size of the per-image code; 0 for none.", ge=0, le=256)
+    contraction: str = option(
+        "linf", "How unbounded space is bounded.", choices=("linf", "l2", "none")
+    )
+    background: str = option(
+        "last_sample",
+        "Colour behind the last sample.",
+        choices=("last_sample", "black", "white", "random"),
+    )
+    average_init_density: float = option(0.01, "Scale of density at the start.", ge=1e-6, le=1e3)
+    single_jitter: bool = option(True, "One random offset per ray instead of one per sample.")
+    camera_mode: str = option(
+        "so3xr3", "Camera optimisation.", choices=("off", "so3xr3", "se3")
+    )
+    camera_translation_penalty: float = option(1e-2, "Weight on moved cameras.", ge=0.0, le=1e3)
+    camera_rotation_penalty: float = option(1e-3, "Weight on turned cameras.", ge=0.0, le=1e3)
+    interlevel_weight: float = option(1.0, "Weight of the interlevel loss.", ge=0.0, le=1e3)
+    distortion_weight: float = option(0.002, "Weight of the distortion loss.", ge=0.0, le=1e3)
+    anneal_steps: int = option(1000, "Steps over which proposal weights sharpen.", ge=0, le=10**6)
+    anneal_slope: float = option(10.0, "Slope of that sharpening.", ge=0.0, le=1e3)
+    proposal_warmup_steps: int = option(
+        5000, "Steps over which proposal updates become rarer.", ge=1, le=10**7
+    )
+    proposal_update_every: int = option(5, "Steps between proposal updates then.", ge=1, le=1000)
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which pixels are trained on."""
+
+    long_side_px: int = option(1600, "Images are reduced to this.", unit="px", ge=32, le=16384)
+    eval_mode: str = option(
+        "fraction", "How held-out images are chosen.", choices=("fraction", "interval", "none")
+    )
+    eval_fraction: float = option(
+        0.1, "Share held out, at equal intervals, at least 5 images.", ge=0.0, le=0.9
+    )
+    eval_interval: int = option(8, "With `interval`: every n-th image is held out.", ge=2, le=1000)
+    scale_poses: bool = option(True, "Scale the scene so that cameras lie in [-1, 1]^3.")
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam and its exponential decay; rates as nerfstudio 1.1.5."""
+
+    lr: float = option(1e-2, "Rate of fields and proposals at the start.", ge=1e-7, le=1.0)
+    lr_final: float = option(1e-4, "Rate at the end of the decay.", ge=1e-9, le=1.0)
+    decay_steps: int = option(200_000, "Length of the decay.", unit="steps", ge=1, le=10**8)
+    camera_lr: float = option(1e-3, "Rate of the cameras at the start.", ge=1e-8, le=1.0)
+    camera_lr_final: float = option(1e-4, "Rate of the cameras at the end.", ge=1e-9, le=1.0)
+    camera_decay_steps: int = option(5000, "Length of their decay.", unit="steps", ge=1, le=10**8)
+    eps: float = option(1e-15, "Adam's epsilon.", ge=0.0, le=1.0)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A whole training run."""
+
+    method: str = option("nerfacto", "The model.", choices=("nerfacto",))
+    max_steps: int = option(30_000, "Optimiser steps.", unit="steps", ge=1, le=10**7)
+    max_seconds: float = option(
+        0.0, "Stop after this much training time; 0 for no limit.", unit="s", ge=0.0, le=10**7
+    )
+    rays_per_step: int = option(4096, "Rays in a batch.", ge=1, le=2**20)
+    checkpoint_seconds: float = option(
+        60.0, "Time between checkpoints.", unit="s", ge=1.0, le=86400.0
+    )
+    preview_every_steps: int = option(
+        0, "Steps between preview pictures; 0 for a tenth of the run.", ge=0, le=10**7
+    )
+    device: str = option("auto", "Where to train.", choices=("auto", "cpu", "cuda"))
+    engine: str = option(
+        "auto",
+        "`fast` uses compiled kernels, `plain` the PyTorch definitions.",
+        choices=("auto", "plain", "fast"),
+    )
+    model: NerfactoConfig = option(NerfactoConfig, "The model's options.")
+    data: DataConfig = option(DataConfig, "The data's options.")
+    optimizer: OptimizerConfig = option(OptimizerConfig, "The optimiser's options.")

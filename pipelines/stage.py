@@ -1,0 +1,107 @@
+"""What a stage is, and what it is given.
+
+A stage reads the folders of earlier stages and writes one folder of its own. It knows nothing of
+databases, queues or object stores: the runner around it (a worker, or `python -m pipelines run`)
+brings the inputs, publishes the folder and writes its manifest. This file imports no torch.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from pipelines.errors import Cancelled
+from pipelines.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A file that a finished job offers for download.
+
+    name: what people see and download, unique in a job. path: relative to the stage's folder.
+    opens_with: one or two programs, shown beside the download.
+    """
+
+    name: str
+    path: str
+    media_type: str
+    opens_with: str
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One row of the registry.
+
+    name: also the folder's name and the options' prefix.
+    version: raised when the same inputs and options give another result.
+    after: stages that must have succeeded or been skipped; their folders are the inputs.
+    reads: stages whose folders the stage reads (a subset of all that come before it).
+    run: dotted path "module:function" of `(options, ctx) -> summary`; resolved only where it runs.
+    options: name of the options class in `pipelines.options`.
+    needs_gpu: whether a GPU worker should take it when there is one.
+    time_limit_s: hard limit for one attempt.
+    """
+
+    name: str
+    version: int
+    after: tuple[str, ...]
+    reads: tuple[str, ...]
+    run: str
+    options: str
+    needs_gpu: bool = False
+    time_limit_s: float = 3600.0
+    artifacts: tuple[Artifact, ...] = ()
+
+
+class ProgressSink(Protocol):
+    """Receives a stage's progress: fraction in [0, 1], a short message, seconds left or None."""
+
+    def __call__(self, fraction: float, message: str, eta_s: float | None) -> None: ...
+
+
+def _ignore_progress(fraction: float, message: str, eta_s: float | None) -> None:
+    del fraction, message, eta_s
+
+
+@dataclass
+class StageContext:
+    """All that a stage may touch besides its options.
+
+    stage: its name.
+    workspace: the job's folder; a stage reads earlier stages' folders from it.
+    out: the folder the stage writes to, empty at the start, published as a whole afterwards.
+    checkpoint: a folder that outlives a failed attempt, also when the next one runs elsewhere;
+        a stage that calls `checkpoint_saved` after writing it can go on from there.
+    seed: fixed per job, so that a run can be repeated.
+    """
+
+    stage: str
+    workspace: Workspace
+    out: Path
+    checkpoint: Path
+    seed: int = 0
+    logger: logging.Logger = field(default_factory=lambda: logging.getLogger("nerfworks.stage"))
+    on_progress: ProgressSink = _ignore_progress
+    is_cancelled: Callable[[], bool] = lambda: False
+    on_checkpoint: Callable[[], None] = lambda: None
+
+    def progress(self, fraction: float, message: str = "", eta_s: float | None = None) -> None:
+        """Report progress and notice a cancel. Cheap: call it as often as is convenient."""
+        self.check_cancelled()
+        self.on_progress(min(max(fraction, 0.0), 1.0), message, eta_s)
+
+    def check_cancelled(self) -> None:
+        """Raise `Cancelled` once the job's cancel was asked for."""
+        if self.is_cancelled():
+            raise Cancelled(f"The job was cancelled during {self.stage}.")
+
+    def checkpoint_saved(self) -> None:
+        """Tell the runner that `checkpoint` holds a complete state worth keeping."""
+        self.on_checkpoint()
+
+
+StageFunction = Callable[[Any, StageContext], dict[str, Any]]
+"""`(options, ctx) -> summary`; the summary is JSON-able and ends in the manifest and the report."""
