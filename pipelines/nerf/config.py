@@ -8,8 +8,12 @@ departure.
 
 from __future__ import annotations
 
+import dataclasses
+import typing
 from dataclasses import dataclass, field
 from typing import Any
+
+from pipelines.nerf.errors import NerfError
 
 
 def option(default: Any, help: str, **bounds: Any) -> Any:
@@ -149,3 +153,73 @@ class TrainConfig:
     model: NerfactoConfig = option(NerfactoConfig, "The model's options.")
     data: DataConfig = option(DataConfig, "The data's options.")
     optimizer: OptimizerConfig = option(OptimizerConfig, "The optimiser's options.")
+
+
+def validate(config: TrainConfig) -> None:
+    """Check every value against its bounds, and the values against each other.
+
+    Raises NerfError `bad_config` that names the option, its value and what is allowed.
+    """
+    _check_fields(config, "train")
+    model = config.model
+    rounds, networks = len(model.num_proposal_samples), len(model.proposals)
+    if rounds < 1 or networks < 1:
+        raise _bad("train.model.proposals", networks, "at least one network and one round")
+    if networks < rounds and not model.share_proposal_network:
+        allowed = f"at least the {rounds} rounds of num_proposal_samples, or share_proposal_network"
+        raise _bad("train.model.proposals", f"{networks} networks", allowed)
+    if model.near >= model.far:
+        raise _bad("train.model.near", model.near, f"less than far ({model.far})")
+    grids = {"train.model.grid": model.grid}
+    grids |= {f"train.model.proposals.{i}.grid": p.grid for i, p in enumerate(model.proposals)}
+    for path, grid in grids.items():
+        if grid.max_res < grid.min_res:
+            raise _bad(f"{path}.max_res", grid.max_res, f"at least min_res ({grid.min_res})")
+
+
+def _bad(path: str, value: object, allowed: str) -> NerfError:
+    return NerfError(
+        "bad_config",
+        f"The option {path} is {value!r}; allowed: {allowed}.",
+        f"Set {path} to an allowed value.",
+    )
+
+
+def _check_fields(config: Any, path: str) -> None:
+    """Bounds and choices of one dataclass and of those inside it."""
+    for item in dataclasses.fields(config):
+        value, name = getattr(config, item.name), f"{path}.{item.name}"
+        if dataclasses.is_dataclass(value):
+            _check_fields(value, name)
+            continue
+        choices = item.metadata.get("choices")
+        if choices and value not in choices:
+            raise _bad(name, value, ", ".join(choices))
+        low, high = item.metadata.get("ge"), item.metadata.get("le")
+        for part in value if isinstance(value, tuple) else (value,):
+            if dataclasses.is_dataclass(part):
+                _check_fields(part, name)
+            elif low is not None and not low <= part <= high:
+                raise _bad(name, value, f"{low} to {high}")
+
+
+def config_from_dict(cls: Any, values: dict[str, Any]) -> Any:
+    """The inverse of `dataclasses.asdict` for the classes here, also after a trip through JSON.
+
+    Raises NerfError `bad_config` for an unknown option.
+    """
+    hints = typing.get_type_hints(cls)
+    made: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in hints:
+            allowed = ", ".join(sorted(hints))
+            raise NerfError("bad_config", f"{cls.__name__} has no option {name}: {allowed}.")
+        annotation = hints[name]
+        if dataclasses.is_dataclass(annotation):
+            value = config_from_dict(annotation, value)
+        elif typing.get_origin(annotation) is tuple:
+            item = typing.get_args(annotation)[0]
+            is_nested = dataclasses.is_dataclass(item)
+            value = tuple(config_from_dict(item, part) if is_nested else part for part in value)
+        made[name] = value
+    return cls(**made)

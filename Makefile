@@ -1,0 +1,58 @@
+# The commands people need: make demo, make test, make up, make check, make fix.
+# A machine needs only Python 3.11 or 3.12 and make; everything else is installed into .venv.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || echo python3)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+HOST ?= 127.0.0.1
+PORT ?= 8000
+CAPTURE ?=
+export CAPTURE HOST PORT
+
+.DEFAULT_GOAL := help
+.PHONY: help demo up test check fix install install-test lock clean
+
+help: ## Show this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
+
+demo: install ## Run one capture through the whole service: make demo [CAPTURE=path]
+	@$(BIN)/python -m deploy.demo
+
+up: install ## Keep the service running here: make up [PORT=8000] [HOST=0.0.0.0]
+	@$(BIN)/python -m deploy.local
+
+test: install-test ## Install what the tests need and run them all
+	@$(BIN)/python -m pytest
+
+check: install-test ## Lint, types and import rules
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+	@$(BIN)/python -m pytest -q tests/test_architecture.py tests/test_docs.py
+
+fix: install-test ## Format and mend what can be mended
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+install: $(VENV)/.installed ## Install the service into .venv
+
+install-test: $(VENV)/.installed-test ## Install the service and its tests' needs into .venv
+
+lock: install-test ## Write requirements*.txt anew from pyproject.toml (run in a fresh clone)
+	@$(BIN)/python -m deploy.lock
+
+$(VENV)/.installed: requirements.txt pyproject.toml deploy/system.py
+	@$(PYTHON) deploy/system.py
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "Installing nerfworks into $(VENV) (the first time takes a few minutes)"
+	@$(PIP) install --quiet --requirement requirements.txt
+	@$(PIP) install --quiet --no-deps --editable .
+	@touch $@
+
+$(VENV)/.installed-test: $(VENV)/.installed requirements-test.txt
+	@$(PIP) install --quiet --requirement requirements-test.txt
+	@touch $@
+
+clean: ## Remove .venv and the caches; never the service's data
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

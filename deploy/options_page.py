@@ -1,0 +1,61 @@
+"""Write docs/options.md from the options themselves: python -m deploy.options_page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pipelines.options import PRESETS, STAGE_OPTIONS
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "options.md"
+
+
+def rows(prefix: str, schema: dict[str, Any], definitions: dict[str, Any]) -> list[str]:
+    """Table rows of a model's options, nested ones under their dotted names."""
+    lines = []
+    for name, field in schema.get("properties", {}).items():
+        path = f"{prefix}.{name}"
+        reference = field.get("$ref")
+        if reference:
+            nested = definitions[reference.rsplit("/", 1)[1]]
+            lines.append(f"| `{path}` | | | {nested.get('description', '').splitlines()[0]} |")
+            lines += rows(path, nested, definitions)
+            continue
+        default = json.dumps(field.get("default")) if "default" in field else ""
+        limits = " or ".join(f"`{choice}`" for choice in field.get("enum", []))
+        low = field.get("minimum", field.get("exclusiveMinimum"))
+        high = field.get("maximum", field.get("exclusiveMaximum"))
+        if low is not None or high is not None:
+            limits = f"{low} to {high}"
+        description = field.get("description", "").replace("|", "\\|")
+        lines.append(f"| `{path}` | {default} | {limits} | {description} |")
+    return lines
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [
+        "# Options\n",
+        "Written by `python -m deploy.options_page`; do not edit.\n",
+        "`--set stage.option=value` on the command line, `options` in `POST /v1/jobs`, and the",
+        "same as JSON Schema from `GET /v1/options`.\n",
+        "## Presets\n",
+        "| preset | what for |",
+        "|---|---|",
+        *(f"| `{preset.name}` | {preset.summary} |" for preset in PRESETS.values()),
+    ]
+    for preset in PRESETS.values():
+        overrides = json.dumps(preset.overrides, indent=2)
+        parts += [f"\nWhat `{preset.name}` changes:\n", "```json", overrides, "```"]
+    for stage, model in STAGE_OPTIONS.items():
+        schema = model.model_json_schema()
+        parts += [f"\n## {stage}\n", (model.__doc__ or "").strip() + "\n"]
+        table = rows(stage, schema, schema.get("$defs", {}))
+        if table:
+            parts += ["| option | default | allowed | meaning |", "|---|---|---|---|", *table]
+    return "\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), "utf-8")

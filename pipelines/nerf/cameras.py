@@ -1,0 +1,233 @@
+"""Cameras: pixels <-> rays, lens distortion, and the way from world to scene space.
+
+Frames and units are those of README.md: camera axes are OpenGL (+X right, +Y up, looks along -Z),
+the centre of the top-left pixel is (0.5, 0.5), rays have unit directions in scene space. Lenses:
+PINHOLE, OPENCV (radial k1..k4 as powers r^2..r^8, tangential p1, p2) and OPENCV_FISHEYE (angular
+k1..k4 as powers theta^2..theta^8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.lenses import distort, undistort
+from pipelines.nerf.rays import Rays
+
+CAMERA_MODELS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE")
+
+
+def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
+    """(width, height) with the longer side at most `long_side`; never larger than it was."""
+    scale = min(1.0, long_side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+@dataclass(frozen=True)
+class SceneTransform:
+    """scene = scale * (world - center). Rotation is the identity.
+
+    center: world units. scale: scene units per world unit, > 0. A distance t in the scene is
+    t / scale in the world. All in float64: a geo-referenced world has offsets of 10^6 that float32
+    cannot hold.
+    """
+
+    center: tuple[float, float, float]
+    scale: float
+
+    @classmethod
+    def fit(cls, camera_centers: ArrayLike, *, scale_poses: bool = True) -> SceneTransform:
+        """Centred on the mean camera, with all cameras in [-1, 1]^3 where `scale_poses`.
+
+        camera_centers: [N, 3], world units. Raises NerfError `bad_cameras` unless finite.
+        """
+        centers = np.asarray(camera_centers, dtype=np.float64).reshape(-1, 3)
+        if len(centers) == 0 or not np.isfinite(centers).all():
+            raise NerfError(
+                "bad_cameras", "There is no camera centre, or one is not finite.", "Check poses."
+            )
+        center = centers.mean(axis=0)
+        reach = float(np.abs(centers - center).max())
+        scale = 1.0 / reach if scale_poses and reach > 0.0 else 1.0
+        return cls(center=(float(center[0]), float(center[1]), float(center[2])), scale=scale)
+
+    def scene_from_world(self, points: ArrayLike) -> NDArray[np.float64]:
+        """World points [..., 3] in scene units."""
+        return (np.asarray(points, dtype=np.float64) - np.asarray(self.center)) * self.scale
+
+    def world_from_scene(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Scene points [..., 3] in world units."""
+        return np.asarray(points, dtype=np.float64) / self.scale + np.asarray(self.center)
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """A batch of N cameras, in scene space.
+
+    scene_from_camera: [N, 3, 4] float32, rotation and camera centre.
+    focal: [N, 2] float32, px. principal: [N, 2] float32, px. size: [N, 2] int64, width and height.
+    distortion: [N, 6] float32: k1, k2, k3, k4, p1, p2. fisheye: [N] bool.
+    distorted: whether any lens needs more than the pinhole formula.
+    """
+
+    scene_from_camera: Tensor
+    focal: Tensor
+    principal: Tensor
+    size: Tensor
+    distortion: Tensor
+    fisheye: Tensor
+    distorted: bool
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        world_from_camera: ArrayLike,
+        scene: SceneTransform,
+        widths: ArrayLike,
+        heights: ArrayLike,
+        focal: ArrayLike,
+        principal: ArrayLike,
+        models: Sequence[str] | None = None,
+        distortion: ArrayLike | None = None,
+    ) -> Cameras:
+        """Cameras from plain numbers, brought to scene space in float64.
+
+        world_from_camera: [N, 3, 4], world units. widths, heights: [N]. focal, principal: [N, 2].
+        models: N of `CAMERA_MODELS`, default PINHOLE. distortion: [N, 6]: k1, k2, k3, k4, p1, p2.
+        Raises NerfError `bad_cameras` naming what is wrong.
+        """
+        poses = np.array(world_from_camera, dtype=np.float64)
+        num = len(poses)
+        _require(poses.shape == (num, 3, 4) and num > 0, "world_from_camera is not [N, 3, 4]")
+        _require(bool(np.isfinite(poses).all()), "world_from_camera is not finite")
+        gram = poses[:, :, :3] @ poses[:, :, :3].transpose(0, 2, 1)
+        _require(
+            bool(np.abs(gram - np.eye(3)).max() < 1e-3 and (np.linalg.det(poses[:, :, :3]) > 0).all()),
+            "world_from_camera holds something other than a rotation",
+        )
+        poses[:, :, 3] = scene.scene_from_world(poses[:, :, 3])
+        names = ["PINHOLE"] * num if models is None else list(models)
+        _require(len(names) == num, "models has another length than world_from_camera")
+        for name in names:
+            _require(name in CAMERA_MODELS, f"model {name} is none of {', '.join(CAMERA_MODELS)}")
+        terms = np.zeros((num, 6)) if distortion is None else np.array(distortion, np.float64)
+        terms[[name == "PINHOLE" for name in names]] = 0.0
+        size = np.stack([np.asarray(widths), np.asarray(heights)], axis=-1).astype(np.int64)
+        focal_px, principal_px = np.array(focal, np.float64), np.array(principal, np.float64)
+        for label, array, width in (
+            ("focal", focal_px, 2),
+            ("principal", principal_px, 2),
+            ("distortion", terms, 6),
+            ("widths and heights", size, 2),
+        ):
+            _require(array.shape == (num, width), f"{label} is not [N, {width}]")
+            _require(bool(np.isfinite(array).all()), f"{label} is not finite")
+        _require(bool((size > 0).all() and (focal_px > 0).all()), "a size or focal is not positive")
+        return cls(
+            scene_from_camera=torch.from_numpy(poses).float(),
+            focal=torch.from_numpy(focal_px).float(),
+            principal=torch.from_numpy(principal_px).float(),
+            size=torch.from_numpy(size),
+            distortion=torch.from_numpy(terms).float(),
+            fisheye=torch.tensor([name == "OPENCV_FISHEYE" for name in names]),
+            distorted=bool(np.any(terms != 0.0)) or "OPENCV_FISHEYE" in names,
+        )
+
+    def __len__(self) -> int:
+        return self.scene_from_camera.shape[0]
+
+    def select(self, indices: Sequence[int]) -> Cameras:
+        """The cameras at these positions, in this order."""
+        rows = torch.tensor(list(indices), dtype=torch.int64)
+        tensors = {
+            item.name: getattr(self, item.name)[rows]
+            for item in fields(self)
+            if item.name != "distorted"
+        }
+        return Cameras(**tensors, distorted=self.distorted)
+
+    def to(self, device: torch.device | str) -> Cameras:
+        """The cameras on another device."""
+        tensors = {
+            item.name: getattr(self, item.name).to(device)
+            for item in fields(self)
+            if item.name != "distorted"
+        }
+        return Cameras(**tensors, distorted=self.distorted)
+
+    def resized(self, long_side: int) -> Cameras:
+        """The same views with images of at most that long side, in pixels."""
+        sizes = [reduced_size(int(w), int(h), long_side) for w, h in self.size.tolist()]
+        size = torch.tensor(sizes, dtype=torch.int64, device=self.size.device)
+        ratio = (size.double() / self.size.double()).float()
+        return replace(self, size=size, focal=self.focal * ratio, principal=self.principal * ratio)
+
+    def generate_rays(
+        self, camera_indices: Tensor, pixels: Tensor, *, with_pixel_area: bool = False
+    ) -> Rays:
+        """The rays through pixels.
+
+        camera_indices: [R] int64. pixels: [R, 2], x and y, pixel centres at .5.
+        with_pixel_area: also give each pixel's solid angle (three times the work).
+        """
+        directions = self._directions(camera_indices, pixels)
+        area = None
+        if with_pixel_area:
+            steps = torch.eye(2, dtype=pixels.dtype, device=pixels.device)
+            right = self._directions(camera_indices, pixels + steps[0]) - directions
+            down = self._directions(camera_indices, pixels + steps[1]) - directions
+            area = torch.linalg.cross(right, down).norm(dim=-1)
+        return Rays(
+            origins=self.scene_from_camera[camera_indices, :, 3],
+            directions=directions,
+            camera_indices=camera_indices,
+            pixel_area=area,
+        )
+
+    def image_rays(self, index: int) -> Rays:
+        """The rays through all pixel centres of one camera, row by row: R = height * width."""
+        width, height = self.size[index].tolist()
+        device = self.size.device
+        x = torch.arange(width, device=device, dtype=torch.float32) + 0.5
+        y = torch.arange(height, device=device, dtype=torch.float32) + 0.5
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+        indices = torch.full((len(pixels),), index, dtype=torch.int64, device=device)
+        return self.generate_rays(indices, pixels)
+
+    def project(self, points: Tensor, camera_indices: Tensor) -> tuple[Tensor, Tensor]:
+        """Where points appear.
+
+        points: [P, 3], scene units. camera_indices: [P] int64.
+        Returns (pixels [P, 2], z_depth [P]); z_depth is along the optical axis, scene units, not
+        positive behind the camera, where only a fisheye's pixels mean anything.
+        """
+        pose = self.scene_from_camera[camera_indices]
+        local = (pose[:, :, :3].transpose(1, 2) @ (points - pose[:, :, 3])[..., None]).squeeze(-1)
+        # OpenCV's axes, in which lens formulas are written: y down, z forward.
+        local = local * torch.tensor([1.0, -1.0, -1.0], dtype=local.dtype, device=local.device)
+        plane = distort(local, self.distortion[camera_indices], self.fisheye[camera_indices])
+        return plane * self.focal[camera_indices] + self.principal[camera_indices], local[:, 2]
+
+    def _directions(self, camera_indices: Tensor, pixels: Tensor) -> Tensor:
+        """Unit directions [R, 3] in scene space."""
+        plane = (pixels - self.principal[camera_indices]) / self.focal[camera_indices]
+        if self.distorted:
+            terms, fisheye = self.distortion[camera_indices], self.fisheye[camera_indices]
+            local = undistort(plane, terms, fisheye)
+        else:
+            local = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=-1)
+        local = local * torch.tensor([1.0, -1.0, -1.0], dtype=local.dtype, device=local.device)
+        turned = (self.scene_from_camera[camera_indices, :, :3] @ local[..., None]).squeeze(-1)
+        return torch.nn.functional.normalize(turned, dim=-1)
+
+
+def _require(condition: bool, problem: str) -> None:
+    if not condition:
+        raise NerfError("bad_cameras", f"The cameras cannot be used: {problem}.", "Check poses.")

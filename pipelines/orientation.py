@@ -1,0 +1,198 @@
+"""From a reconstruction's arbitrary frame to ours: gravity along -Z, centred, cameras in [-1, 1]^3.
+
+Symbols: N cameras; `world_from_camera` is [N, 3, 4] in OpenGL axes (+X right, +Y up, looks along
+-Z) unless a name says `opencv` (+X right, +Y down, looks along +Z). X, Y, Z below are a camera's
+axes in the world: the columns of its rotation. Everything is float64.
+
+A phone is held so that its picture is upright: the X axes of its cameras are level, however far
+it is tipped up or down. The direction most orthogonal to all X axes is therefore vertical, even
+where every camera looks down. That is nerfstudio's `vertical` (cameras/camera_utils.py,
+auto_orient_and_center_poses), here with weights that make a few rolled cameras harmless.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+_MIN_TURN = 0.17
+"""Below this root mean square of the second axis (about 10 degrees), X axes are parallel."""
+_MIN_SIGN = 0.1
+"""A mean camera axis this short along the vertical says nothing about which end is up."""
+_MIN_CONVERGENCE = 0.01
+"""Smallest eigenvalue of the mean of (I - d d^T): about 6 degrees between optical axes."""
+_MAX_FOCUS_DISTANCE = 20.0
+"""A focus farther than this, in units of the cameras' own extent, is not determined."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale * rotation @ x + translation. rotation: [3, 3], det +1. translation: [3]."""
+
+    rotation: Array
+    translation: Array
+    scale: float
+
+    def apply_to_points(self, points: Array) -> Array:
+        """points: [..., 3] in the old frame, to the new frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def apply_to_directions(self, directions: Array) -> Array:
+        """directions: [..., 3], turned only."""
+        return directions @ self.rotation.T
+
+    def apply_to_cameras(self, world_from_camera: Array) -> Array:
+        """[N, 3, 4] to [N, 3, 4]: centres are moved, rotations stay orthonormal."""
+        rotation = self.rotation @ world_from_camera[:, :, :3]
+        centers = self.apply_to_points(world_from_camera[:, :, 3])
+        return np.concatenate([rotation, centers[:, :, None]], axis=2)
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """How the world was turned and centred. up_from: vertical, camera_up or none.
+
+    centered_on: focus (the point that the cameras look at) or centers (their mean).
+    """
+
+    similarity: Similarity
+    up_from: str
+    centered_on: str
+
+
+def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
+    """[N, 3, 4] with OpenCV camera axes to the same poses with OpenGL camera axes."""
+    return world_from_camera_opencv * np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def find_up(world_from_camera: Array) -> tuple[Array, str]:
+    """The direction away from gravity, [3] unit, and how it was found: vertical or camera_up.
+
+    Raises ValueError where there are no cameras.
+    """
+    if len(world_from_camera) == 0:
+        raise ValueError("no cameras to find the vertical from")
+    x_axes = world_from_camera[:, :, 0]
+    mean_up: Array = world_from_camera[:, :, 1].mean(axis=0)
+    _, singular, rows = np.linalg.svd(x_axes, full_matrices=True)
+    if len(x_axes) >= 2 and singular[1] >= _MIN_TURN * np.sqrt(len(x_axes)):
+        up = _most_orthogonal(x_axes, rows[2])
+        return up * _sign_of_up(up, world_from_camera), "vertical"
+    level = mean_up - rows[0] * float(mean_up @ rows[0])
+    length = float(np.linalg.norm(level))
+    if length < _MIN_SIGN:
+        return np.array([0.0, 0.0, 1.0]), "camera_up"
+    return level / length, "camera_up"
+
+
+def _most_orthogonal(axes: Array, start: Array) -> Array:
+    """The unit vector u that minimises sum |axis . u|, by reweighted least squares.
+
+    axes: [N, 3] unit. start: [3] unit, the least squares answer. The absolute value, not the
+    square, so that a few cameras rolled by 90 degrees do not tilt the rest.
+    """
+    up = start
+    for _ in range(20):
+        weights = 1.0 / np.maximum(np.abs(axes @ up), 1e-3)
+        _, _, rows = np.linalg.svd(axes * np.sqrt(weights)[:, None], full_matrices=False)
+        if abs(float(rows[2] @ up)) > 1.0 - 1e-12:
+            break
+        up = rows[2]
+    return np.asarray(up, np.float64)
+
+
+def _sign_of_up(up: Array, world_from_camera: Array) -> float:
+    """+1 or -1: cameras' own up decides; where they look straight down, their gaze does."""
+    along_up = float(world_from_camera[:, :, 1].mean(axis=0) @ up)
+    if abs(along_up) >= _MIN_SIGN:
+        return 1.0 if along_up > 0 else -1.0
+    backwards = float(world_from_camera[:, :, 2].mean(axis=0) @ up)
+    return 1.0 if backwards >= 0 else -1.0
+
+
+def rotation_to_z(up: Array) -> Array:
+    """The smallest rotation [3, 3] that turns the unit vector `up` [3] to +Z."""
+    target = np.array([0.0, 0.0, 1.0])
+    cosine = float(up @ target)
+    if cosine < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = np.cross(up, target)
+    cross = np.array(
+        [[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]]
+    )
+    return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+
+
+def find_focus(world_from_camera: Array) -> Array | None:
+    """The point [3] nearest to the optical axes of the cameras that face it.
+
+    None where axes are parallel, where most cameras look away from it (a room filmed from
+    within), or where it lies too far off to be determined.
+    """
+    centers = world_from_camera[:, :, 3]
+    gaze = -world_from_camera[:, :, 2]
+    extent = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0))
+    facing = np.ones(len(centers), bool)
+    focus: Array | None = None
+    for _ in range(10):
+        if facing.sum() < max(2.0, 0.5 * len(centers)):
+            return None
+        across = np.eye(3) - gaze[facing, :, None] * gaze[facing, None, :]
+        if np.linalg.eigvalsh(across.mean(axis=0))[0] < _MIN_CONVERGENCE:
+            return None
+        moments = np.einsum("nij,nj->i", across, centers[facing])
+        focus = np.linalg.solve(across.sum(axis=0), moments)
+        now_facing = np.einsum("ni,ni->n", focus - centers, gaze) > 0
+        if np.array_equal(now_facing, facing):
+            break
+        facing = now_facing
+    if focus is None or not np.isfinite(focus).all() or extent == 0.0:
+        return None
+    distance = float(np.linalg.norm(focus - centers.mean(axis=0)))
+    return focus if distance <= _MAX_FOCUS_DISTANCE * extent else None
+
+
+def normalise(world_from_camera: Array, *, orient: bool = True) -> Normalisation:
+    """The similarity that puts a reconstruction of unknown frame and scale into ours.
+
+    world_from_camera: [N, 3, 4], OpenGL axes. Afterwards gravity points along -Z (if `orient`),
+    the origin is the focus, or else the mean of the camera centres, and the largest absolute
+    coordinate of a camera centre is 1. Cameras in one single point keep their scale.
+    """
+    up, up_from = find_up(world_from_camera) if orient else (np.array([0.0, 0.0, 1.0]), "none")
+    rotation = rotation_to_z(up)
+    focus = find_focus(world_from_camera)
+    centers = world_from_camera[:, :, 3]
+    center = centers.mean(axis=0) if focus is None else focus
+    reach = float(np.abs((centers - center) @ rotation.T).max(initial=0.0))
+    scale = 1.0 / reach if reach > 1e-12 else 1.0
+    similarity = Similarity(
+        rotation=rotation, translation=-scale * rotation @ center, scale=scale
+    )
+    return Normalisation(similarity, up_from, "centers" if focus is None else "focus")
+
+
+def align_points(source: Array, target: Array) -> Similarity:
+    """The similarity that moves `source` onto `target`, least squares.
+
+    source, target: [N, 3], N >= 3, not all on one line. Source: Umeyama, "Least-squares estimation
+    of transformation parameters between two point patterns", 1991. Raises ValueError for shapes
+    that do not fit or points that coincide.
+    """
+    if source.shape != target.shape or source.ndim != 2 or len(source) < 3:
+        raise ValueError(f"cannot align {list(source.shape)} with {list(target.shape)} points")
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    centered = source - source_mean
+    variance = float((centered**2).sum() / len(source))
+    if variance == 0.0:
+        raise ValueError("cannot align points that coincide")
+    covariance = (target - target_mean).T @ centered / len(source)
+    left, singular, right = np.linalg.svd(covariance)
+    signs = np.array([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
+    rotation = left @ np.diag(signs) @ right
+    scale = float((singular * signs).sum() / variance)
+    return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)

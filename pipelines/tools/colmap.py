@@ -1,0 +1,380 @@
+"""COLMAP through pycolmap: features, matches, sparse models; plain arrays come out.
+
+A `Reconstructor` owns one database. Images enter under names that are their index ("000012.jpg"),
+so that no name in a capture can upset a pair list. pycolmap blocks for minutes: each call runs in
+a thread while the calling thread counts rows in the database, reports them through a `Watch`, and
+ends the call by its cancellation token where the watch raises. Learned features are not offered:
+the wheel aborts the process when asked for them. Run this in a process that may die.
+
+Axes here are COLMAP's: cameras look along +Z, +Y down. Pixel centres lie at (0.5, 0.5), as ours.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from pipelines.cameras_file import Intrinsics
+from pipelines.errors import ToolError
+
+Watch = Callable[[int], None]
+"""Called every half second with the number of items done; what it raises ends the call."""
+
+_POLL_S = 0.5
+_COUNT_FEATURES = "SELECT COUNT(*) FROM keypoints"
+_COUNT_PAIRS = "SELECT COUNT(*) FROM two_view_geometries"
+_PAIR_BLOCK = 40
+"""Pairs written to the database at once: small, so that progress is seen."""
+_ANGLE_SAMPLE = 3000
+
+LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+}
+"""The order of COLMAP's parameters (src/colmap/sensor/models.h); `f` is both focal lengths."""
+
+_ROTATION_ONLY = (
+    int(pycolmap.TwoViewGeometryConfiguration.PANORAMIC),
+    int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC),
+)
+
+
+@dataclass(frozen=True)
+class CameraGroup:
+    """Images, by index, that share one lens."""
+
+    indices: tuple[int, ...]
+    lens: str
+
+
+@dataclass(frozen=True)
+class MapperSettings:
+    """Thresholds of incremental mapping. relaxed: for captures that the defaults fail on."""
+
+    refine_focal: bool = True
+    refine_principal_point: bool = False
+    relaxed: bool = False
+
+
+@dataclass(frozen=True)
+class PairStatistics:
+    """What matching found.
+
+    num_features: [N] int, per image. best_inliers: [N] int, verified matches with the image's best
+    partner. num_pairs: pairs compared. num_verified: pairs with a verified geometry.
+    num_rotation_only: verified pairs that a pure rotation (or one plane) explains.
+    """
+
+    num_features: npt.NDArray[np.int64]
+    best_inliers: npt.NDArray[np.int64]
+    num_pairs: int
+    num_verified: int
+    num_rotation_only: int
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """One reconstruction, in its own arbitrary frame and scale.
+
+    indices: [N], the images it holds, ascending. cameras: lenses in use.
+    camera_of: [N], index into `cameras`. world_from_camera: [N, 3, 4] float64, OpenCV axes.
+    points: [P, 3] float64. colors: [P, 3] uint8. track_lengths: [P], images that see each point.
+    error_px: mean reprojection error. angle_deg: median over points of the widest angle between
+    two of its rays; small where the camera hardly moved.
+    """
+
+    indices: tuple[int, ...]
+    cameras: tuple[Intrinsics, ...]
+    camera_of: tuple[int, ...]
+    world_from_camera: npt.NDArray[np.float64]
+    points: npt.NDArray[np.float64]
+    colors: npt.NDArray[np.uint8]
+    track_lengths: npt.NDArray[np.int64]
+    error_px: float
+    angle_deg: float
+
+
+def best_model(models: Sequence[SparseModel]) -> SparseModel | None:
+    """The model with most images, then most points; None where there is none.
+
+    COLMAP's first model is often a spurious one of a few images: its order says nothing.
+    """
+    return max(models, key=lambda model: (len(model.indices), len(model.points)), default=None)
+
+
+def intrinsics_from_colmap(
+    model: str, width: int, height: int, params: Sequence[float]
+) -> Intrinsics:
+    """A COLMAP camera as ours. Raises ToolError for a lens model that we cannot express."""
+    names = LENS_PARAMETERS.get(model)
+    if names is None or len(names) != len(params):
+        raise ToolError(
+            f"COLMAP returned a camera of model {model}, which is not supported.",
+            hint=f"Choose one of {', '.join(sorted(LENS_PARAMETERS))}.",
+        )
+    values = {name: float(value) for name, value in zip(names, params, strict=True)}
+    focal = values.pop("f", None)
+    if focal is not None:
+        values |= {"fl_x": focal, "fl_y": focal}
+    ours = "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV"
+    if model.endswith("PINHOLE"):
+        ours = "PINHOLE"
+    return Intrinsics(width=width, height=height, model=ours, **values)
+
+
+class Reconstructor:
+    """Features, matches and models of one list of images.
+
+    database: COLMAP's database, made where it is missing. images: in the order that indices mean.
+    scratch: a folder for links and models, no longer needed afterwards.
+    """
+
+    def __init__(
+        self,
+        database: Path,
+        images: Sequence[Path],
+        scratch: Path,
+        *,
+        num_threads: int = -1,
+        seed: int = 0,
+    ) -> None:
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR.value)
+        self.database = database
+        self.scratch = scratch
+        self.num_threads = num_threads
+        self.seed = seed
+        self.names = [f"{i:06d}{path.suffix.lower()}" for i, path in enumerate(images)]
+        self.links = scratch / "images"
+        self.links.mkdir(parents=True, exist_ok=True)
+        for name, path in zip(self.names, images, strict=True):
+            link = self.links / name
+            if not link.is_symlink():
+                link.symlink_to(path.resolve())
+
+    def extract(
+        self, groups: Sequence[CameraGroup], max_image_px: int, num_features: int, watch: Watch
+    ) -> None:
+        """Find SIFT features in every image; images of a group share one camera.
+
+        max_image_px: long side at which features are found; positions are of the full image.
+        """
+        options = pycolmap.FeatureExtractionOptions()
+        options.max_image_size = max_image_px
+        options.num_threads = self.num_threads
+        options.sift.max_num_features = num_features
+        for group in groups:
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = group.lens
+            names = [self.names[index] for index in group.indices]
+            self._run(
+                "finding features",
+                lambda token, reader=reader, names=names: pycolmap.extract_features(
+                    self.database,
+                    self.links,
+                    image_names=names,
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=options,
+                    cancellation_token=token,
+                ),
+                lambda: watch(self._count(_COUNT_FEATURES)),
+            )
+
+    def match(self, pairs: Iterable[tuple[int, int]], watch: Watch) -> None:
+        """Match and verify pairs of indices; those already in the database are not done again.
+
+        watch: receives the number of all pairs in the database.
+        """
+        listed = self.scratch / "pairs.txt"
+        listed.write_text("".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs), "utf-8")
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.num_threads = self.num_threads
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = listed
+        pairing.block_size = _PAIR_BLOCK
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = self.seed
+        self._run(
+            "matching images",
+            lambda token: pycolmap.match_image_pairs(
+                self.database,
+                matching_options=matching,
+                pairing_options=pairing,
+                verification_options=verification,
+                cancellation_token=token,
+            ),
+            lambda: watch(self._count(_COUNT_PAIRS)),
+        )
+
+    def map(self, settings: MapperSettings, watch: Watch) -> list[SparseModel]:
+        """Incremental mapping with its bundle adjustments: all models, in COLMAP's order.
+
+        watch: receives the number of images placed so far.
+        """
+        output = self.scratch / "models"
+        shutil.rmtree(output, ignore_errors=True)
+        output.mkdir(parents=True)
+        options = self._mapping_options(settings)
+        placed = [0]
+
+        def count_one() -> None:
+            placed[0] += 1
+
+        found = self._run(
+            "mapping",
+            lambda token: pycolmap.incremental_mapping(
+                self.database,
+                self.links,
+                output,
+                options=options,
+                next_image_callback=count_one,
+                cancellation_token=token,
+            ),
+            lambda: watch(min(placed[0], len(self.names))),
+        )
+        return [sparse_model(model) for model in found.values() if model.num_reg_images() > 1]
+
+    def statistics(self) -> PairStatistics:
+        """What extraction and matching put into the database."""
+        num_features = np.zeros(len(self.names), np.int64)
+        best = np.zeros(len(self.names), np.int64)
+        with sqlite3.connect(self.database) as connection:
+            index_of = {
+                image_id: image_index(name)
+                for image_id, name in connection.execute("SELECT image_id, name FROM images")
+            }
+            for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints"):
+                num_features[index_of[image_id]] = rows
+            pairs = connection.execute(
+                "SELECT pair_id, rows, config FROM two_view_geometries"
+            ).fetchall()
+        connection.close()
+        verified = [pair for pair in pairs if pair[1] > 0]
+        for pair_id, rows, _ in verified:
+            for image_id in pycolmap.pair_id_to_image_pair(pair_id):
+                index = index_of[image_id]
+                best[index] = max(best[index], rows)
+        return PairStatistics(
+            num_features=num_features,
+            best_inliers=best,
+            num_pairs=len(pairs),
+            num_verified=len(verified),
+            num_rotation_only=sum(config in _ROTATION_ONLY for _, _, config in verified),
+        )
+
+    def _mapping_options(self, settings: MapperSettings) -> Any:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = self.num_threads
+        options.random_seed = self.seed
+        options.min_model_size = 3
+        options.max_num_models = 10
+        options.ba_refine_focal_length = settings.refine_focal
+        options.ba_refine_principal_point = settings.refine_principal_point
+        if settings.relaxed:
+            options.min_num_matches = 10
+            options.mapper.init_min_tri_angle = 4.0
+            options.mapper.init_min_num_inliers = 50
+            options.mapper.abs_pose_min_num_inliers = 15
+            options.mapper.abs_pose_min_inlier_ratio = 0.15
+        return options
+
+    def _count(self, query: str) -> int:
+        """Rows in the database; 0 while it is being made or is locked."""
+        try:
+            connection = sqlite3.connect(f"file:{self.database}?mode=ro", uri=True, timeout=0.2)
+        except sqlite3.OperationalError:
+            return 0
+        try:
+            return int(connection.execute(query).fetchone()[0])
+        except sqlite3.OperationalError:
+            return 0
+        finally:
+            connection.close()
+
+    def _run(
+        self,
+        what: str,
+        call: Callable[[Any], Any],
+        poll: Callable[[], None],
+    ) -> Any:
+        """Run `call(token)` in a thread and `poll` here, until the call ends or `poll` raises."""
+        token = pycolmap.CancellationToken()
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="colmap") as executor:
+            future = executor.submit(call, token)
+            try:
+                while not wait([future], timeout=_POLL_S).done:
+                    poll()
+            finally:
+                if not future.done():
+                    token.cancel()
+        try:
+            return future.result()
+        except (RuntimeError, ValueError, IndexError) as error:
+            raise ToolError(
+                f"COLMAP failed while {what} of {len(self.names)} images.",
+                details={"log": str(error)[-2000:]},
+            ) from error
+
+
+def image_index(name: str) -> int:
+    """The index that an image's name in the database stands for."""
+    return int(Path(name).stem)
+
+
+def sparse_model(reconstruction: Any) -> SparseModel:
+    """A `pycolmap.Reconstruction` as plain arrays."""
+    images = sorted(
+        (reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()),
+        key=lambda image: image_index(image.name),
+    )
+    camera_ids = sorted({image.camera_id for image in images})
+    cameras = [reconstruction.camera(camera_id) for camera_id in camera_ids]
+    poses = np.stack([image.cam_from_world().inverse().matrix() for image in images])
+    points = list(reconstruction.points3D.values())
+    center_of = {
+        image.image_id: pose[:, 3] for image, pose in zip(images, poses, strict=True)
+    }
+    return SparseModel(
+        indices=tuple(image_index(image.name) for image in images),
+        cameras=tuple(
+            intrinsics_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
+            for camera in cameras
+        ),
+        camera_of=tuple(camera_ids.index(image.camera_id) for image in images),
+        world_from_camera=poses,
+        points=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        track_lengths=np.array([point.track.length() for point in points], np.int64),
+        error_px=float(reconstruction.compute_mean_reprojection_error()),
+        angle_deg=_median_widest_angle_deg(points, center_of),
+    )
+
+
+def _median_widest_angle_deg(
+    points: Sequence[Any], center_of: dict[int, npt.NDArray[np.float64]]
+) -> float:
+    """The median over (at most 3,000) points of the widest angle between their rays, degrees."""
+    if not points:
+        return 0.0
+    widest: list[float] = []
+    for point in points[:: max(1, len(points) // _ANGLE_SAMPLE)]:
+        centers = np.array([center_of[element.image_id] for element in point.track.elements])
+        rays = point.xyz - centers
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        widest.append(float(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+    return float(np.degrees(np.median(widest)))

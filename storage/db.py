@@ -1,0 +1,206 @@
+"""Engine, sessions, column types and the clock.
+
+Sessions commit at the edge: a caller opens `Database.session_scope()` once per unit of work and the
+functions of this room never commit. On SQLite a writing session starts with BEGIN IMMEDIATE, so
+that two writers queue up instead of failing half-way; on PostgreSQL rows are locked where needed.
+
+The clock of leases is the database's: `now(session)` asks PostgreSQL, so that machines with clocks
+apart agree, and reads this machine's clock for SQLite, which only one machine can share. All times
+are UTC.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    DateTime,
+    Dialect,
+    Engine,
+    String,
+    TypeDecorator,
+    create_engine,
+    event,
+    func,
+    make_url,
+    select,
+)
+from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session, sessionmaker
+
+BUSY_TIMEOUT_S = 30.0
+
+
+def clean_text(text: str, limit: int | None = None) -> str:
+    """Text that every database takes: no NUL, no lone surrogates, at most `limit` characters."""
+    clean = text.replace("\x00", "").encode("utf-8", "replace").decode("utf-8")
+    return clean if limit is None else clean[:limit]
+
+
+def clean_json(value: Any) -> Any:
+    """JSON that every database takes: clean text; NaN and infinities become null."""
+    if isinstance(value, str):
+        return clean_text(value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {clean_text(str(key)): clean_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [clean_json(item) for item in value]
+    return value
+
+
+class CleanJson(TypeDecorator[Any]):
+    """JSON (JSONB on PostgreSQL) that cannot be refused for what it holds."""
+
+    impl = JSON
+    cache_ok = True
+
+    def __init__(self, none_as_null: bool = False) -> None:
+        super().__init__(none_as_null=none_as_null)
+        self.none_as_null = none_as_null
+
+    def load_dialect_impl(self, dialect: Dialect) -> Any:
+        """JSONB where there is one."""
+        kind = JSONB if dialect.name == "postgresql" else JSON
+        return dialect.type_descriptor(kind(none_as_null=self.none_as_null))
+
+    def process_bind_param(self, value: Any, dialect: Dialect) -> Any:
+        """Clean on the way in."""
+        return clean_json(value)
+
+    def coerce_compared_value(self, op: Any, value: Any) -> Any:
+        """Index and compare as JSON does."""
+        return self.impl_instance.coerce_compared_value(op, value)
+
+
+class CleanText(TypeDecorator[str]):
+    """Bounded text: longer values are cut, characters that a database refuses are dropped."""
+
+    impl = String
+    cache_ok = True
+
+    def __init__(self, length: int) -> None:
+        super().__init__(length)
+        self.limit = length
+
+    def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
+        """Clean on the way in."""
+        return None if value is None else clean_text(value, self.limit)
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """An aware UTC time on both databases; SQLite holds it without the zone."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Aware in; naive UTC for SQLite."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError("times in the database must carry a zone")
+        value = value.astimezone(UTC)
+        return value.replace(tzinfo=None) if dialect.name == "sqlite" else value
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Aware UTC out."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+def now(session: Session) -> datetime:
+    """The clock that leases go by: PostgreSQL's own, or this machine's for SQLite."""
+    if session.get_bind().dialect.name == "postgresql":
+        moment: datetime = session.execute(select(func.clock_timestamp())).scalar_one()
+        return moment.astimezone(UTC)
+    return datetime.now(UTC)
+
+
+def _prepare_sqlite(connection: Any, _record: Any) -> None:
+    connection.isolation_level = None  # we say BEGIN ourselves, see _begin_sqlite
+    cursor = connection.cursor()
+    for pragma in (
+        f"busy_timeout = {int(BUSY_TIMEOUT_S * 1000)}",
+        "journal_mode = WAL",
+        "synchronous = NORMAL",
+        "foreign_keys = ON",
+    ):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    reading = connection.get_execution_options().get("nerfworks_read_only", False)
+    connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
+
+
+def make_engine(url: str) -> Engine:
+    """An engine for `sqlite:///...` or `postgresql...`; makes the folder of an SQLite file.
+
+    A plain `postgresql://` URL is read as `postgresql+psycopg://`. Raises ValueError for others.
+    """
+    parsed = make_url(url)
+    if parsed.drivername in ("postgresql", "postgres"):
+        parsed = parsed.set(drivername="postgresql+psycopg")
+    if parsed.get_backend_name() == "sqlite":
+        if not parsed.database or parsed.database == ":memory:":
+            raise ValueError("SQLite needs a file: sqlite:///path/to/file.db")
+        Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+        engine = create_engine(parsed, connect_args={"timeout": BUSY_TIMEOUT_S})
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return engine
+    if parsed.drivername != "postgresql+psycopg":
+        raise ValueError(f"no database of kind {parsed.drivername}: use sqlite or postgresql")
+    return create_engine(
+        parsed,
+        pool_pre_ping=True,
+        pool_size=5,
+        max_overflow=15,
+        connect_args={"connect_timeout": 10},
+    )
+
+
+class Database:
+    """The records of one service. Safe to share between threads; sessions are not."""
+
+    def __init__(self, url: str) -> None:
+        self.engine = make_engine(url)
+        self._write = sessionmaker(self.engine, expire_on_commit=False)
+        self._read = sessionmaker(
+            self.engine.execution_options(nerfworks_read_only=True), expire_on_commit=False
+        )
+
+    @contextmanager
+    def session_scope(self) -> Iterator[Session]:
+        """A session that may write. Commits when the block ends, rolls back when it raises."""
+        with self._write.begin() as session:
+            yield session
+
+    @contextmanager
+    def read_scope(self) -> Iterator[Session]:
+        """A session that only reads; on SQLite it never waits for writers."""
+        with self._read() as session:
+            try:
+                yield session
+            finally:
+                session.rollback()
+
+    def ping(self) -> None:
+        """Raise sqlalchemy's error where the database does not answer."""
+        with self.read_scope() as session:
+            session.execute(select(1))
+
+    def dispose(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()

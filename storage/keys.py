@@ -1,0 +1,40 @@
+"""Every object key, and every prefix.
+
+    captures/CAPTURE/content                     the uploaded bytes
+    jobs/JOB/STAGE/ATTEMPT-TOKEN/...             what one attempt of a stage published
+    jobs/JOB/STAGE/checkpoint/TOKEN-NUMBER/...   the latest checkpoint of a running stage
+
+The token is the fencing token of the claim, so that two attempts never write to one place.
+"""
+
+from __future__ import annotations
+
+
+def capture_prefix(capture_id: str) -> str:
+    """All bytes of a capture."""
+    return f"captures/{capture_id}/"
+
+
+def capture_content(capture_id: str) -> str:
+    """The uploaded bytes."""
+    return f"{capture_prefix(capture_id)}content"
+
+
+def job_prefix(job_id: str) -> str:
+    """All bytes of a job."""
+    return f"jobs/{job_id}/"
+
+
+def stage_prefix(job_id: str, stage: str) -> str:
+    """All bytes of one stage of a job, of every attempt."""
+    return f"{job_prefix(job_id)}{stage}/"
+
+
+def attempt_prefix(job_id: str, stage: str, attempt: int, token: int) -> str:
+    """What one attempt publishes."""
+    return f"{stage_prefix(job_id, stage)}{attempt}-{token}/"
+
+
+def checkpoint_prefix(job_id: str, stage: str, token: int, number: int) -> str:
+    """One checkpoint: the claim's token and its number within the claim."""
+    return f"{stage_prefix(job_id, stage)}checkpoint/{token}-{number}/"

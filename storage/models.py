@@ -1,0 +1,192 @@
+"""The records. State columns change only through `storage.jobs`.
+
+A stage row carries its lease: `lease_token` rises by one with every claim and is the fencing token
+that every later write of that claim must show.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import BigInteger, Boolean, ForeignKey, Index, Integer, MetaData, String, Text
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+
+from storage.db import CleanJson, CleanText, UtcDateTime
+
+_BIG = BigInteger().with_variant(Integer(), "sqlite")  # only INTEGER counts up by itself there
+ID_LENGTH = 28
+
+
+def new_id() -> str:
+    """A random id that sorts by time: 12 hex digits of milliseconds, 16 of chance."""
+    return f"{int(time.time() * 1000):012x}{secrets.token_hex(8)}"
+
+
+class Base(DeclarativeBase):
+    """Common ground: named constraints, so that migrations can speak of them."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+class Capture(Base):
+    """Uploaded bytes. A deleted one stays as a tombstone for the jobs that speak of it."""
+
+    __tablename__ = "captures"
+
+    id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
+    filename: Mapped[str] = mapped_column(CleanText(255))
+    kind: Mapped[str] = mapped_column(String(32))
+    bytes: Mapped[int] = mapped_column(BigInteger)
+    sha256: Mapped[str] = mapped_column(String(64))
+    object_key: Mapped[str] = mapped_column(String(255))
+    details: Mapped[dict[str, Any]] = mapped_column(CleanJson, default=dict)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    __table_args__ = (Index(None, "created_at", "id"),)
+
+
+class Job(Base):
+    """One run of the stages on one capture."""
+
+    __tablename__ = "jobs"
+
+    id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
+    capture_id: Mapped[str] = mapped_column(ForeignKey("captures.id"), index=True)
+    state: Mapped[str] = mapped_column(String(16))
+    preset: Mapped[str] = mapped_column(String(32))
+    preset_reason: Mapped[str] = mapped_column(CleanText(300), default="")
+    options: Mapped[dict[str, Any]] = mapped_column(CleanJson)
+    labels: Mapped[dict[str, str]] = mapped_column(CleanJson, default=dict)
+    seed: Mapped[int] = mapped_column(BigInteger, default=0)
+    error: Mapped[dict[str, Any] | None] = mapped_column(CleanJson(none_as_null=True))
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    cancel_requested_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    capture: Mapped[Capture] = relationship(lazy="raise")
+    stages: Mapped[list[StageRow]] = relationship(order_by="StageRow.seq", lazy="select")
+
+    __table_args__ = (Index(None, "created_at", "id"), Index(None, "state", "created_at"))
+
+
+class StageRow(Base):
+    """One stage of one job, and its lease.
+
+    attempt: claims so far, without those that were released. crashes: how many of them ended with
+    the process instead of an error. not_before: when a retry may start. ready_at: since when it
+    could run. rung_at: when the bell last rang for it. manifest: what `manifest.json` holds.
+    """
+
+    __tablename__ = "stages"
+
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), index=True)
+    name: Mapped[str] = mapped_column(String(32))
+    seq: Mapped[int] = mapped_column(Integer)
+    after: Mapped[list[str]] = mapped_column(CleanJson)
+    state: Mapped[str] = mapped_column(String(16))
+    needs_gpu: Mapped[bool] = mapped_column(Boolean, default=False)
+    attempt: Mapped[int] = mapped_column(Integer, default=0)
+    max_attempts: Mapped[int] = mapped_column(Integer, default=3)
+    crashes: Mapped[int] = mapped_column(Integer, default=0)
+    not_before: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    ready_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    rung_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    lease_owner: Mapped[str | None] = mapped_column(String(128))
+    lease_token: Mapped[int] = mapped_column(Integer, default=0)
+    lease_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    heartbeat_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    progress: Mapped[float] = mapped_column(default=0.0)
+    message: Mapped[str] = mapped_column(CleanText(300), default="")
+    eta_s: Mapped[float | None] = mapped_column()
+    started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    error: Mapped[dict[str, Any] | None] = mapped_column(CleanJson(none_as_null=True))
+    output_prefix: Mapped[str | None] = mapped_column(String(255))
+    summary: Mapped[dict[str, Any] | None] = mapped_column(CleanJson(none_as_null=True))
+    manifest: Mapped[dict[str, Any] | None] = mapped_column(
+        CleanJson(none_as_null=True), deferred=True
+    )
+    checkpoint_prefix: Mapped[str | None] = mapped_column(String(255))
+
+    __table_args__ = (Index(None, "state", "lease_until"), Index(None, "job_id", "name", unique=True))
+
+
+class Event(Base):
+    """What happened, in order: the feed of state changes, written in their transactions."""
+
+    __tablename__ = "events"
+
+    seq: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    stage: Mapped[str | None] = mapped_column(String(32))
+    kind: Mapped[str] = mapped_column(String(48))
+    data: Mapped[dict[str, Any]] = mapped_column(CleanJson, default=dict)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+    __table_args__ = (Index(None, "job_id", "seq"),)
+
+
+class LogLine(Base):
+    """One line that a stage wrote."""
+
+    __tablename__ = "log_lines"
+
+    id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    stage: Mapped[str] = mapped_column(String(32))
+    attempt: Mapped[int] = mapped_column(Integer)
+    text: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+    __table_args__ = (Index(None, "job_id", "id"), Index(None, "job_id", "stage", "id"))
+
+
+class Worker(Base):
+    """A worker process and what it has. It is live while `seen_at` is fresh."""
+
+    __tablename__ = "workers"
+
+    id: Mapped[str] = mapped_column(String(128), primary_key=True)
+    hostname: Mapped[str] = mapped_column(CleanText(255))
+    pid: Mapped[int] = mapped_column(Integer)
+    queues: Mapped[list[str]] = mapped_column(CleanJson)
+    slots: Mapped[int] = mapped_column(Integer, default=1)
+    has_gpu: Mapped[bool] = mapped_column(Boolean, default=False)
+    started_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    seen_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
+class ApiKey(Base):
+    """A key of the API: only its SHA-256 is kept."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    name: Mapped[str] = mapped_column(CleanText(100))
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+
+class PendingDeletion(Base):
+    """Bytes whose record is gone: kept until the object store has dropped them too."""
+
+    __tablename__ = "pending_deletions"
+
+    id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
+    prefix: Mapped[str] = mapped_column(String(255))
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)

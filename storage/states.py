@@ -1,0 +1,54 @@
+"""The states of jobs and stages, and which may follow which.
+
+`storage.jobs` is the only place that changes a state; each change there names its old state in the
+UPDATE itself and is checked against these tables.
+
+    stage:  blocked -> ready -> running -> succeeded
+                ^        |         |-> ready        released, retried, or its worker was lost
+                |        |         |-> failed       no attempts left, or not worth another
+            (create)     |         |-> cancelled
+                 blocked, ready -> cancelled        the job was cancelled, or failed elsewhere
+                 skipped                            given at creation: the capture has no use for it
+
+    job:    queued -> running -> succeeded | failed
+            queued -> cancelled
+            running -> cancelling -> cancelled      (at once where no stage is running)
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+STAGE_TRANSITIONS: MappingProxyType[str, frozenset[str]] = MappingProxyType(
+    {
+        "blocked": frozenset({"ready", "cancelled"}),
+        "ready": frozenset({"running", "cancelled"}),
+        "running": frozenset({"ready", "succeeded", "failed", "cancelled"}),
+        "succeeded": frozenset(),
+        "failed": frozenset(),
+        "cancelled": frozenset(),
+        "skipped": frozenset(),
+    }
+)
+JOB_TRANSITIONS: MappingProxyType[str, frozenset[str]] = MappingProxyType(
+    {
+        "queued": frozenset({"running", "cancelled"}),
+        "running": frozenset({"succeeded", "failed", "cancelling", "cancelled"}),
+        "cancelling": frozenset({"cancelled"}),
+        "succeeded": frozenset(),
+        "failed": frozenset(),
+        "cancelled": frozenset(),
+    }
+)
+STAGE_STATES = tuple(STAGE_TRANSITIONS)
+JOB_STATES = tuple(JOB_TRANSITIONS)
+STAGE_DONE = frozenset({"succeeded", "skipped"})
+JOB_TERMINAL = frozenset(state for state, following in JOB_TRANSITIONS.items() if not following)
+JOB_LIVE = frozenset(JOB_STATES) - JOB_TERMINAL
+
+
+def check_transition(what: str, old: str, new: str) -> None:
+    """Raise ValueError for a change that the tables do not hold: a fault of our own code."""
+    table = JOB_TRANSITIONS if what == "job" else STAGE_TRANSITIONS
+    if new not in table[old]:
+        raise ValueError(f"a {what} cannot go from {old} to {new}")

@@ -1,0 +1,61 @@
+"""A whole job on what a cluster uses: PostgreSQL, an S3 server and Redis, presigned downloads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.client import Client
+from deploy.embedded import Embedded, free_port
+from tests.capture_writers import write_polycam
+from tests.samples import SMALL
+from tests.services import S3Server
+
+pytestmark = [pytest.mark.services, pytest.mark.slow]
+
+
+def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
+    postgres_url: str,
+    s3_server: S3Server,
+    redis_url: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in {
+        "NERFWORKS_DATABASE_URL": postgres_url,
+        "NERFWORKS_REDIS_URL": redis_url,
+        "NERFWORKS_OBJECTS_URL": f"s3://{s3_server.bucket}/e2e",
+        **s3_server.environment(),
+    }.items():
+        monkeypatch.setenv(name, value)
+    archive = tmp_path / "polycam.zip"
+    write_polycam(archive, num=40)
+    options: dict[str, Any] = {name: SMALL[name] for name in SMALL if name != "poses"}
+
+    embedded = Embedded.at(tmp_path / "home", "127.0.0.1", free_port(), tmp_path / "cache")
+    supervisor = embedded.supervisor(print)
+    assert [program.name for program in supervisor.programs] == ["api", "worker"]
+    supervisor.start()
+    try:
+        with Client(embedded.url, embedded.secrets.api_key) as client:
+            capture = client.upload(archive)
+            assert capture.kind == "polycam"
+            job = client.create_job(capture.id, preset="preview", options=options)
+            job = client.wait(job.id, timeout=400)
+            assert job.state == "succeeded", job.error
+            states = {stage.name: stage.state for stage in job.stages}
+            assert states["frames"] == states["poses"] == "skipped"
+            for artifact in client.artifacts(job.id):
+                assert "X-Amz-Signature" in artifact.url
+            client.download(job.id, tmp_path / "out")
+            client.delete_job(job.id)
+            client.delete_capture(capture.id)
+    finally:
+        supervisor.stop()
+    report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
+    assert report["capture"]["kind"] == "polycam"
+    assert report["metrics"]["psnr"] >= 20.0
+    assert s3_server.keys() == [], "bytes are left after the deletes"

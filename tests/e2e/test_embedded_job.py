@@ -1,0 +1,67 @@
+"""A whole job over HTTP on the embedded defaults, judged against the sample's exact truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from api.client import Client
+from deploy.embedded import Embedded
+from deploy.supervisor import Supervisor
+from pipelines.cameras_file import CamerasFile
+from pipelines.registry import STAGE_NAMES, STAGES
+from tests.judge import judge_mesh, judge_poses
+from tests.samples import SMALL
+
+pytestmark = [pytest.mark.services, pytest.mark.slow]
+
+REPORT_KEYS = (
+    ("capture", "kind"),
+    ("poses", "num_images"),
+    ("poses", "num_registered"),
+    ("poses", "registered_ratio"),
+    ("metrics", "psnr"),
+    ("metrics", "ssim"),
+    ("metrics", "num_images"),
+    ("metrics", "width"),
+    ("metrics", "height"),
+    ("metrics", "per_image"),
+    ("options",),
+    ("versions",),
+)
+
+
+def test_video_over_http_comes_back_as_assets_true_to_the_scene(
+    service: tuple[Client, Embedded, Supervisor], clip: tuple[Path, Path], tmp_path: Path
+) -> None:
+    client, _, _ = service
+    capture = client.upload(clip[0])
+    assert capture.kind == "video"
+    job = client.create_job(capture.id, preset="preview", options=SMALL)
+    job = client.wait(job.id, timeout=540)
+    assert job.state == "succeeded", job.error
+
+    out = tmp_path / "out"
+    client.download(job.id, out)
+    names = {artifact.name for stage in STAGES for artifact in stage.artifacts}
+    assert {path.name for path in out.iterdir()} >= names
+
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    for path in REPORT_KEYS:
+        value = report
+        for key in path:
+            value = value[key]
+    assert {f"{stage}_s" for stage in STAGE_NAMES if stage != "report"} <= set(report["timings"])
+    assert report["poses"]["registered_ratio"] >= 0.9
+    assert report["metrics"]["psnr"] >= 20.0
+    assert report["metrics"]["num_images"] >= 5
+
+    truth = CamerasFile.load(clip[1])
+    cameras = CamerasFile.load(out / "cameras.json")
+    poses = judge_poses(cameras, truth)
+    assert poses.mean_centre_error < 0.01, poses
+    mesh = judge_mesh(out / "mesh.ply", poses.similarity, truth)
+    assert mesh.accuracy_median < 0.03, mesh
+    assert mesh.completeness_median < 0.03, mesh

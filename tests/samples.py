@@ -1,0 +1,35 @@
+"""The sample capture as the tests use it, and options below `preview` for whole jobs.
+
+The thresholds that go with `SMALL` are those of the tests: lower than the product's, high enough
+that a broken stage misses them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pipelines.sample.film import film_capture
+
+SMALL: dict[str, Any] = {
+    "frames": {"num_frames": 40, "long_side_px": 640},
+    "poses": {"max_image_px": 640, "num_features": 2048},
+    "train": {
+        "max_steps": 400,
+        "rays_per_step": 1024,
+        "data": {"long_side_px": 240},
+        "checkpoint_seconds": 5.0,
+        "model": {"grid": {"log2_table_size": 15, "max_res": 256}},
+        "optimizer": {"decay_steps": 400},
+    },
+    "pointcloud": {"num_points": 20_000},
+    "mesh": {"resolution": 96, "num_views": 30, "render_long_side_px": 160},
+    "video": {"num_frames": 16, "long_side_px": 160},
+}
+
+
+def sample_clip(folder: Path) -> tuple[Path, Path]:
+    """Film the analytic scene. Returns the clip and its true cameras (cameras.json)."""
+    clip, truth = folder / "sample.mp4", folder / "truth.json"
+    film_capture(clip).save(truth)
+    return clip, truth

@@ -1,0 +1,76 @@
+"""The documentation says what the code does: options, API calls, environment, commands."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from api.app import create_app
+from pipelines.options import PRESETS, STAGE_OPTIONS
+from pipelines.registry import STAGES
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text("utf-8")
+
+
+def leaves(schema: dict[str, Any], definitions: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """(name, schema) of each option in a model's JSON schema, nested ones included."""
+    found: list[tuple[str, dict[str, Any]]] = []
+    for name, field in schema.get("properties", {}).items():
+        found.append((name, field))
+        reference = field.get("$ref")
+        if reference:
+            nested = definitions[reference.rsplit("/", 1)[1]]
+            found += [(f"{name}.{inner}", value) for inner, value in leaves(nested, definitions)]
+    return found
+
+
+def test_every_option_says_what_it_means() -> None:
+    silent = []
+    for stage, model in STAGE_OPTIONS.items():
+        schema = model.model_json_schema()
+        for name, field in leaves(schema, schema.get("$defs", {})):
+            if "$ref" not in field and not field.get("description"):
+                silent.append(f"{stage}.{name}")
+    assert not silent, f"options without a description: {silent}"
+
+
+def test_options_page_names_every_option_and_preset() -> None:
+    page = (ROOT / "docs" / "options.md").read_text("utf-8")
+    missing = []
+    for stage, model in STAGE_OPTIONS.items():
+        schema = model.model_json_schema()
+        for name, _ in leaves(schema, schema.get("$defs", {})):
+            if f"`{stage}.{name}`" not in page:
+                missing.append(f"{stage}.{name}")
+    missing += [name for name in PRESETS if f"`{name}`" not in page]
+    assert not missing, f"run `python -m deploy.options_page`; docs/options.md lacks {missing}"
+
+
+def test_readme_names_every_api_call() -> None:
+    schema = create_app().openapi()
+    missing = [
+        f"{method.upper()} {path}"
+        for path, calls in schema["paths"].items()
+        for method in calls
+        if method in ("get", "post", "delete") and path not in README
+    ]
+    assert not missing, f"README.md, the API's table, lacks {missing}"
+
+
+def test_readme_names_every_artifact_and_make_target() -> None:
+    names = [artifact.name for stage in STAGES for artifact in stage.artifacts]
+    missing = [name for name in names if f"`{name}`" not in README]
+    assert not missing, f"README.md lacks the artifacts {missing}"
+    for command in ("make demo", "make test", "make up"):
+        assert command in README, f"README.md does not name {command}"
+
+
+def test_links_in_the_documentation_lead_somewhere() -> None:
+    broken = []
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text("utf-8")):
+            if "://" not in target and not (page.parent / target).exists():
+                broken.append(f"{page.name}: {target}")
+    assert not broken, f"broken links: {broken}"
