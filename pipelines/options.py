@@ -73,6 +73,16 @@ class PosesOptions(StageOptions):
     min_registered: int = Field(
         8, ge=3, le=1000, description="Below this number of registered images the job fails."
     )
+    retry_below_ratio: float = Field(
+        0.8,
+        ge=0,
+        le=1,
+        description="Below this share of registered images, all pairs are matched and thresholds "
+        "relaxed.",
+    )
+    refine_principal_point: bool = Field(
+        False, description="Fit the principal point too; needs many views."
+    )
     orientation: Literal["auto", "none"] = Field(
         "auto", description="Turn the world so that gravity points along -Z."
     )

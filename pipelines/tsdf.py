@@ -25,6 +25,12 @@ from pipelines.scene_bounds import SceneBounds
 
 Floats = NDArray[np.float64]
 
+# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
+_core: Any = open3d.core
+_geometry: Any = open3d.geometry
+_tensor_geometry: Any = open3d.t.geometry
+_utility: Any = open3d.utility
+
 _BLOCK = 8
 _TRUNCATION_VOXELS = 5.0
 _MIN_VIEWS = 2.0
@@ -58,31 +64,30 @@ def fuse(
     """
     origin = (bounds.box_min + bounds.box_max) / 2.0
     voxel = bounds.longest_side / resolution
-    core = open3d.core
-    grid = open3d.t.geometry.VoxelBlockGrid(
+    grid = _tensor_geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight", "color"),
-        attr_dtypes=(core.float32, core.float32, core.float32),
+        attr_dtypes=(_core.float32, _core.float32, _core.float32),
         attr_channels=((1), (1), (3)),
         voxel_size=voxel,
         block_resolution=_BLOCK,
         block_count=10_000,
-        device=core.Device("CPU:0"),
+        device=_core.Device("CPU:0"),
     )
     blocks = _blocks_near_surface(grid, views, bounds, origin)
     if len(blocks) == 0:
         return _empty()
-    keys = core.Tensor(blocks)
+    keys = _core.Tensor(blocks)
     for done, view in enumerate(views, start=1):
         depth = np.where(view.smooth_mask(), view.z_depth, 0.0).astype(np.float32)
         color = np.ascontiguousarray(view.rgb, dtype=np.float32) / np.float32(255.0)
-        lens = core.Tensor(view.lens.matrix())
+        lens = _core.Tensor(view.lens.matrix())
         grid.integrate(
             keys,
-            open3d.t.geometry.Image(core.Tensor(depth[..., None])),
-            open3d.t.geometry.Image(core.Tensor(color)),
+            _tensor_geometry.Image(_core.Tensor(depth[..., None])),
+            _tensor_geometry.Image(_core.Tensor(color)),
             lens,
             lens,
-            core.Tensor(view.camera_from_world_cv(origin)),
+            _core.Tensor(view.camera_from_world_cv(origin)),
             1.0,
             _farthest(view),
             _TRUNCATION_VOXELS,
@@ -101,7 +106,6 @@ def _blocks_near_surface(
     grid: Any, views: Iterable[DepthView], bounds: SceneBounds, origin: Floats
 ) -> NDArray[np.int32]:
     """Coordinates [B, 3] of the blocks that any view's surface inside the bounds touches."""
-    core = open3d.core
     found: set[tuple[int, int, int]] = set()
     for view in views:
         wanted = view.smooth_mask() & bounds.contains(view.points())
@@ -109,9 +113,9 @@ def _blocks_near_surface(
             continue
         depth = np.where(wanted, view.z_depth, 0.0).astype(np.float32)
         keys = grid.compute_unique_block_coordinates(
-            open3d.t.geometry.Image(core.Tensor(depth[..., None])),
-            core.Tensor(view.lens.matrix()),
-            core.Tensor(view.camera_from_world_cv(origin)),
+            _tensor_geometry.Image(_core.Tensor(depth[..., None])),
+            _core.Tensor(view.lens.matrix()),
+            _core.Tensor(view.camera_from_world_cv(origin)),
             1.0,
             _farthest(view),
             _TRUNCATION_VOXELS,
@@ -131,13 +135,13 @@ def clean(mesh: TriangleMesh, bounds: SceneBounds, max_faces: int) -> TriangleMe
     if len(faces) == 0:
         return _empty()
     origin = (bounds.box_min + bounds.box_max) / 2.0
-    legacy = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices - origin),
-        open3d.utility.Vector3iVector(faces),
+    legacy = _geometry.TriangleMesh(
+        _utility.Vector3dVector(mesh.vertices - origin),
+        _utility.Vector3iVector(faces),
     )
-    legacy.vertex_colors = open3d.utility.Vector3dVector(mesh.colors)
-    labels, _, areas = legacy.cluster_connected_triangles()
-    areas = np.asarray(areas)
+    legacy.vertex_colors = _utility.Vector3dVector(mesh.colors)
+    labels, _, piece_areas = legacy.cluster_connected_triangles()
+    areas = np.asarray(piece_areas)
     small = areas < _MIN_COMPONENT_SHARE * areas.max()
     legacy.remove_triangles_by_mask(small[np.asarray(labels)])
     legacy.remove_unreferenced_vertices()

@@ -121,7 +121,10 @@ class StageRow(Base):
     )
     checkpoint_prefix: Mapped[str | None] = mapped_column(String(255))
 
-    __table_args__ = (Index(None, "state", "lease_until"), Index(None, "job_id", "name", unique=True))
+    __table_args__ = (
+        Index(None, "state", "lease_until"),
+        Index(None, "job_id", "name", unique=True),
+    )
 
 
 class Event(Base):

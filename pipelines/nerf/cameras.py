@@ -109,7 +109,9 @@ class Cameras:
         _require(bool(np.isfinite(poses).all()), "world_from_camera is not finite")
         gram = poses[:, :, :3] @ poses[:, :, :3].transpose(0, 2, 1)
         _require(
-            bool(np.abs(gram - np.eye(3)).max() < 1e-3 and (np.linalg.det(poses[:, :, :3]) > 0).all()),
+            bool(
+                np.abs(gram - np.eye(3)).max() < 1e-3 and (np.linalg.det(poses[:, :, :3]) > 0).all()
+            ),
             "world_from_camera holds something other than a rotation",
         )
         poses[:, :, 3] = scene.scene_from_world(poses[:, :, 3])

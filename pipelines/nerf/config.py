@@ -85,9 +85,7 @@ class NerfactoConfig:
     )
     average_init_density: float = option(0.01, "Scale of density at the start.", ge=1e-6, le=1e3)
     single_jitter: bool = option(True, "One random offset per ray instead of one per sample.")
-    camera_mode: str = option(
-        "so3xr3", "Camera optimisation.", choices=("off", "so3xr3", "se3")
-    )
+    camera_mode: str = option("so3xr3", "Camera optimisation.", choices=("off", "so3xr3", "se3"))
     camera_translation_penalty: float = option(1e-2, "Weight on moved cameras.", ge=0.0, le=1e3)
     camera_rotation_penalty: float = option(1e-3, "Weight on turned cameras.", ge=0.0, le=1e3)
     interlevel_weight: float = option(1.0, "Weight of the interlevel loss.", ge=0.0, le=1e3)

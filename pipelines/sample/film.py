@@ -165,7 +165,8 @@ def film_capture(
         "crf": 18,
         "profile:v": "high",
         "g": int(FRAME_RATE),
-        "vf": "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,"
+        "vf": "scale=out_color_matrix=bt709:out_range=tv:flags=bicubic+accurate_rnd,"
+        "format=yuv420p,"
         "setparams=range=tv:color_primaries=bt709:color_trc=bt709:colorspace=bt709",
     }
     encode_sideways(path, render_all(truth, num_threads), truth, options, on_frame)

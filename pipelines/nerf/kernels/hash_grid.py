@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.nerf.kernels.runtime import compiled, compiled_parallel, launching
+from pipelines.nerf.kernels.runtime import compiled, run_threads
 
 PRIME_Y = np.int64(2654435761)
 PRIME_Z = np.int64(805459861)
@@ -35,7 +34,14 @@ def corner_terms(x, y, z, resolution, is_dense):  # type: ignore[no-untyped-def]
     """Per axis, the low and high terms whose sum (dense) or xor (hashed) is the entry."""
     if is_dense:
         stride = resolution + 1
-        return x, x + 1, stride * y, stride * (y + 1), stride * stride * z, stride * stride * (z + 1)
+        return (
+            x,
+            x + 1,
+            stride * y,
+            stride * (y + 1),
+            stride * stride * z,
+            stride * stride * (z + 1),
+        )
     return x, x + 1, PRIME_Y * y, PRIME_Y * (y + 1), PRIME_Z * z, PRIME_Z * (z + 1)
 
 
@@ -111,10 +117,10 @@ def encode_points(points, count, table, resolutions, dense, offsets, out):  # ty
                     )
 
 
-@compiled_parallel
-def _forward(points, table, resolutions, dense, offsets, out):  # type: ignore[no-untyped-def]
+@compiled
+def _forward(thread, threads, points, table, resolutions, dense, offsets, out):  # type: ignore[no-untyped-def]
     num_points = len(points)
-    for tile in numba.prange((num_points + TILE - 1) // TILE):
+    for tile in range(thread, (num_points + TILE - 1) // TILE, threads):
         begin = tile * TILE
         count = min(TILE, num_points - begin)
         encode_points(points[begin:], count, table, resolutions, dense, offsets, out[begin:])
@@ -181,31 +187,34 @@ def differentiate_level(  # type: ignore[no-untyped-def]
             grad_points[p, 2] += scale * dz
 
 
-@compiled_parallel
-def _backward_table(points, table, resolutions, dense, offsets, grad_out, threads, grad_table):  # type: ignore[no-untyped-def]
+@compiled
+def _backward_table(
+    thread, threads, points, table, resolutions, dense, offsets, grad_out, grad_table
+):  # type: ignore[no-untyped-def]
     num_features = table.shape[1]
     num_levels = len(resolutions)
-    for thread in numba.prange(threads):
-        # Levels are dealt in turn, because fine levels cost more than coarse ones.
-        for level in range(thread, num_levels, threads):
-            scatter_level(
-                points,
-                table,
-                resolutions[level],
-                dense[level],
-                offsets[level],
-                offsets[level + 1],
-                grad_out,
-                level * num_features,
-                grad_table,
-            )
+    # Levels are dealt in turn, because fine levels cost more than coarse ones.
+    for level in range(thread, num_levels, threads):
+        scatter_level(
+            points,
+            table,
+            resolutions[level],
+            dense[level],
+            offsets[level],
+            offsets[level + 1],
+            grad_out,
+            level * num_features,
+            grad_table,
+        )
 
 
-@compiled_parallel
-def _backward_points(points, table, resolutions, dense, offsets, grad_out, grad_points):  # type: ignore[no-untyped-def]
+@compiled
+def _backward_points(
+    thread, threads, points, table, resolutions, dense, offsets, grad_out, grad_points
+):  # type: ignore[no-untyped-def]
     num_features = table.shape[1]
     num_points = len(points)
-    for tile in numba.prange((num_points + TILE - 1) // TILE):
+    for tile in range(thread, (num_points + TILE - 1) // TILE, threads):
         begin, end = tile * TILE, min((tile + 1) * TILE, num_points)
         for level in range(len(resolutions)):
             differentiate_level(
@@ -227,8 +236,8 @@ class _HashEncode(torch.autograd.Function):
         ctx: Any, points: Tensor, table: Tensor, resolutions: Tensor, dense: Tensor, offsets: Tensor
     ) -> Tensor:
         out = torch.empty(len(points), len(resolutions) * table.shape[1])
-        with launching():
-            _forward(*_arrays(points, table, resolutions, dense, offsets), out.numpy())
+        arrays = _arrays(points, table, resolutions, dense, offsets)
+        run_threads(_forward, *arrays, out.numpy())
         ctx.save_for_backward(points, table, resolutions, dense, offsets)
         return out
 
@@ -240,12 +249,10 @@ class _HashEncode(torch.autograd.Function):
         grad_points = grad_table = None
         if ctx.needs_input_grad[0]:
             grad_points = torch.zeros_like(points)
-            with launching():
-                _backward_points(*arrays, grad_out, grad_points.numpy())
+            run_threads(_backward_points, *arrays, grad_out, grad_points.numpy())
         if ctx.needs_input_grad[1]:
             grad_table = torch.zeros_like(table)
-            with launching() as threads:
-                _backward_table(*arrays, grad_out, threads, grad_table.numpy())
+            run_threads(_backward_table, *arrays, grad_out, grad_table.numpy())
         return grad_points, grad_table, None, None, None
 
 

@@ -13,7 +13,7 @@ from pipelines.camera_path import (
     rotation_matrices,
     smooth_path,
 )
-
+from tests.unit.pipelines.synthetic_views import look_at
 
 
 def arc(num: int, shake: float = 0.0, seed: int = 0) -> Floats:

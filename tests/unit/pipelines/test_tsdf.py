@@ -126,7 +126,7 @@ def test_z_depth_takes_the_median_where_the_expected_depth_was_pulled_away() -> 
 
 
 def test_an_undistorted_lens_keeps_the_field_of_view_and_cuts_a_fisheye() -> None:
-    lens = Pinhole.of(Intrinsics(1080, 1920, 1400.0, 1410.0, 545.0, 950.0, k1=0.1), 481, 2)
+    lens = Pinhole.of(Intrinsics(1080, 1920, 1400.0, 1410.0, 545.0, 950.0, k1=0.1), 480, 2)
     assert (lens.width, lens.height) == (270, 480)
     assert lens.width / lens.fl_x == pytest.approx(1080 / 1400.0)
     assert lens.cx / lens.width == pytest.approx(545.0 / 1080.0)

@@ -1,0 +1,244 @@
+"""Every failure as RFC 9457 `application/problem+json`: the only file that maps errors to HTTP.
+
+Own errors of the other rooms, validation, framework errors (404, 405) and surprises all get the
+same shape. Tracebacks go to the log with the request id, never into an answer.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import re
+import secrets
+from collections.abc import Awaitable, Callable
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from api.problems import (
+    ApiError,
+    ConflictedError,
+    FieldProblem,
+    ForbiddenError,
+    InvalidRequestError,
+    MissingError,
+    NoSpaceError,
+    Problem,
+    UnavailableError,
+)
+from pipelines.errors import CaptureError, PipelineError, ResourceError
+from pipelines.options import OptionsError
+from storage.errors import (
+    ConflictError,
+    InvalidCursorError,
+    InvalidUrlError,
+    NotFoundError,
+    ObjectMissingError,
+    ObjectStoreError,
+    ObjectStoreFullError,
+    StorageError,
+)
+
+logger = logging.getLogger("nerfworks.api")
+
+PROBLEM_TYPE = "application/problem+json"
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_CAPTURE_STATUS = {"too_large": 413, "archive_bomb": 413, "unknown_type": 415}
+_FRAMEWORK_CODES = {404: "not_found", 405: "method_not_allowed"}
+_FRAMEWORK_HINTS = {
+    404: "Check the address; /docs lists every call.",
+    405: "Use one of the methods that the Allow header names.",
+}
+
+
+def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's `responses` for these error statuses, and for those that any call may give."""
+    return {
+        status: {
+            "model": Problem,
+            "content": {PROBLEM_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+            "description": HTTPStatus(status).phrase,
+        }
+        for status in sorted({401, 422, 500, 503, *statuses})
+    }
+
+
+def problem_response(request_path: str, error: ApiError) -> JSONResponse:
+    """The answer for an error."""
+    problem = Problem(
+        type=f"urn:nerfworks:problem:{error.code}",
+        title=HTTPStatus(error.status).phrase,
+        status=error.status,
+        detail=error.detail,
+        instance=request_path,
+        code=error.code,
+        hint=error.hint,
+        errors=error.errors,
+    )
+    return JSONResponse(
+        problem.model_dump(),
+        status_code=error.status,
+        headers={**error.headers, "Cache-Control": "no-store"},
+        media_type=PROBLEM_TYPE,
+    )
+
+
+def _of_pipeline(error: PipelineError) -> ApiError:
+    status = 422
+    if isinstance(error, CaptureError):
+        status = _CAPTURE_STATUS.get(error.code, 422)
+    elif isinstance(error, ResourceError):
+        status = 507 if error.code == "disk_full" else 503
+    return ApiError(error.message, code=error.code, hint=error.hint, status=status)
+
+
+def _of_options(error: OptionsError) -> ApiError:
+    return InvalidRequestError(
+        f"The options are not valid: {error}.",
+        code="options_invalid",
+        hint="GET /v1/options lists every option with its range and meaning.",
+        errors=[FieldProblem(path=path, detail=detail) for path, detail in error.errors],
+    )
+
+
+def _of_validation(error: RequestValidationError) -> ApiError:
+    problems = [
+        FieldProblem(path=".".join(str(part) for part in item["loc"]), detail=str(item["msg"]))
+        for item in error.errors()
+    ]
+    listed = "; ".join(f"{problem.path}: {problem.detail}" for problem in problems)
+    return InvalidRequestError(f"The request is not valid: {listed}.", errors=problems)
+
+
+def _of_framework(error: HTTPException) -> ApiError:
+    hint = _FRAMEWORK_HINTS.get(error.status_code, "Check the request; /docs describes the calls.")
+    code = _FRAMEWORK_CODES.get(error.status_code)
+    return ApiError(
+        f"{error.detail}." if code is None else HTTPStatus(error.status_code).description + ".",
+        code=code or HTTPStatus(error.status_code).name.lower(),
+        hint=hint,
+        status=error.status_code,
+        headers=dict(error.headers or {}),
+    )
+
+
+def _of_storage(error: StorageError) -> ApiError:
+    if isinstance(error, NotFoundError):
+        return MissingError(
+            str(error), code=f"{error.what}_not_found", hint="Check the id; it may be deleted."
+        )
+    if isinstance(error, ConflictError):
+        return ConflictedError(str(error))
+    if isinstance(error, InvalidCursorError):
+        return InvalidRequestError(
+            "The cursor is not one of this service.",
+            code="cursor_invalid",
+            hint="Use next_cursor of the page before, or leave the cursor out.",
+        )
+    if isinstance(error, InvalidUrlError):
+        return ForbiddenError("The signed URL is not valid or has expired.")
+    if isinstance(error, ObjectMissingError):
+        return MissingError("These bytes are no longer there.", code="object_not_found")
+    if isinstance(error, ObjectStoreFullError):
+        return NoSpaceError("The object store has no room left.")
+    if isinstance(error, ObjectStoreError):
+        return UnavailableError(
+            "The object store does not answer.", code="object_store_unavailable"
+        )
+    return ApiError("The service failed on this request.")
+
+
+def to_api_error(error: Exception) -> ApiError:
+    """What an exception means to a client. Whatever is unknown is an `internal_error`."""
+    if isinstance(error, ApiError):
+        return error
+    if isinstance(error, PipelineError):
+        return _of_pipeline(error)
+    if isinstance(error, OptionsError):
+        return _of_options(error)
+    if isinstance(error, RequestValidationError):
+        return _of_validation(error)
+    if isinstance(error, HTTPException):
+        return _of_framework(error)
+    if isinstance(error, StorageError):
+        return _of_storage(error)
+    if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError):
+        return UnavailableError("The database does not answer.", code="database_unavailable")
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return NoSpaceError("The service's disk is full.")
+    return ApiError("The service failed on this request.")
+
+
+async def _handle(request: Request, error: Exception) -> Response:
+    answer = to_api_error(error)
+    if answer.status >= 500:
+        logger.error(
+            "%s %r: %s", request.method, request.url.path, answer.code, exc_info=error
+        )
+    return problem_response(request.url.path, answer)
+
+
+class RequestGuard:
+    """Outermost layer: gives each request an id, and turns a surprise into a problem document.
+
+    A well-formed X-Request-Id of the client is kept, so that logs on both sides meet.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI entry."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        given = dict(scope["headers"]).get(b"x-request-id", b"").decode("latin-1")
+        request_id = given if _REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
+        started = False
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                message.setdefault("headers", [])
+                message["headers"] = [
+                    *message["headers"],
+                    (b"x-request-id", request_id.encode()),
+                    (b"x-content-type-options", b"nosniff"),
+                ]
+            await send(message)
+
+        try:
+            await self.app(scope, receive, send_with_id)
+        except Exception as error:
+            if started:
+                raise
+            logger.exception("request %s: %s %r", request_id, scope["method"], scope["path"])
+            answer = problem_response(scope["path"], to_api_error(error))
+            await answer(scope, receive, send_with_id)
+
+
+def install(app: FastAPI) -> None:
+    """Register the handlers and the guard."""
+    handler: Callable[[Request, Any], Awaitable[Response]] = _handle
+    for kind in (
+        ApiError,
+        PipelineError,
+        OptionsError,
+        RequestValidationError,
+        HTTPException,
+        StorageError,
+        OperationalError,
+        InterfaceError,
+        PoolTimeoutError,
+        OSError,
+    ):
+        app.add_exception_handler(kind, handler)
+    app.add_middleware(RequestGuard)

@@ -1,0 +1,139 @@
+"""The networks: what stands at a place, and what colour it shows in a direction.
+
+Symbols: R rays, S samples, P any leading shape of points; G geometry features, A appearance code.
+Points arrive in scene space and are contracted here. The parameter layout is described in
+README.md; `kernels/` reads it. Wiring is left to `models`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pipelines.nerf.config import NerfactoConfig, ProposalConfig
+from pipelines.nerf.contraction import unit_from_scene
+from pipelines.nerf.encodings import NUM_SPHERICAL_HARMONICS, HashGrid, spherical_harmonics
+
+GRADIENT_CLAMP = 15.0
+
+
+class _TruncatedExp(torch.autograd.Function):
+    """exp whose gradient is bounded: a density of e^20 must not blow up the step."""
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor) -> Tensor:
+        ctx.save_for_backward(logits)
+        return torch.exp(logits)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (logits,) = ctx.saved_tensors
+        return gradients[0] * torch.exp(logits.clamp(-GRADIENT_CLAMP, GRADIENT_CLAMP))
+
+
+def truncated_exp(logits: Tensor) -> Tensor:
+    """exp(x), with exp(clamp(x, -15, 15)) as its derivative. In float32, any shape."""
+    result: Tensor = _TruncatedExp.apply(logits.float() if logits.dtype.itemsize < 4 else logits)  # type: ignore[no-untyped-call]
+    return result
+
+
+class MLP(nn.Module):
+    """Linear layers with ReLU between them and none behind the last.
+
+    widths: (inputs, hidden..., outputs).
+    """
+
+    def __init__(self, *widths: int) -> None:
+        super().__init__()
+        pairs = zip(widths[:-1], widths[1:], strict=True)
+        self.layers = nn.ModuleList(nn.Linear(inputs, outputs) for inputs, outputs in pairs)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """[..., inputs] to [..., outputs]."""
+        return self.tail(self.layers[0](values))
+
+    def tail(self, values: Tensor) -> Tensor:
+        """All that follows the first linear layer, whose outputs are given."""
+        for layer in self.layers[1:]:
+            values = layer(torch.relu_(values))
+        return values
+
+
+class DensityField(nn.Module):
+    """A proposal network: hash grid, one hidden layer, density."""
+
+    def __init__(
+        self, config: ProposalConfig, *, contraction: str, average_init_density: float
+    ) -> None:
+        super().__init__()
+        self.contraction = contraction
+        self.average_init_density = average_init_density
+        self.grid = HashGrid(config.grid)
+        self.mlp = MLP(self.grid.num_outputs, config.hidden_dim, 1)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Density [...] per scene unit at points [..., 3] in scene space."""
+        unit, inside = unit_from_scene(points, self.contraction)
+        logits = self.mlp(self.grid(unit)).squeeze(-1)
+        return density_from_logits(logits, inside, self.average_init_density)
+
+
+def density_from_logits(logits: Tensor, inside: Tensor | None, scale: float) -> Tensor:
+    """scale * exp(logit), 0 where not inside. [...] per scene unit."""
+    density = scale * truncated_exp(logits)
+    return density if inside is None else density * inside
+
+
+class NerfactoField(nn.Module):
+    """Density and colour of the scene.
+
+    num_images: training images, one appearance code each (where the config wants codes).
+    """
+
+    def __init__(self, config: NerfactoConfig, num_images: int) -> None:
+        super().__init__()
+        self.contraction = config.contraction
+        self.average_init_density = config.average_init_density
+        self.geo_feature_dim = config.geo_feature_dim
+        self.grid = HashGrid(config.grid)
+        self.density_mlp = MLP(self.grid.num_outputs, config.hidden_dim, 1 + config.geo_feature_dim)
+        inputs = NUM_SPHERICAL_HARMONICS + config.geo_feature_dim + config.appearance_dim
+        self.color_mlp = MLP(inputs, config.hidden_dim_color, config.hidden_dim_color, 3)
+        self.appearance = (
+            nn.Embedding(num_images, config.appearance_dim) if config.appearance_dim else None
+        )
+
+    def density(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Density [...] per scene unit and geometry features [..., G] at scene points [..., 3]."""
+        unit, inside = unit_from_scene(points, self.contraction)
+        outputs = self.density_mlp(self.grid(unit))
+        density = density_from_logits(outputs[..., 0], inside, self.average_init_density)
+        return density, outputs[..., 1:]
+
+    def color(self, directions: Tensor, geometry: Tensor, codes: Tensor | None) -> Tensor:
+        """Colour [R, S, 3] in [0, 1].
+
+        directions: [R, 3], unit. geometry: [R, S, G] from `density`. codes: [R, A] or None.
+        The first layer's products with direction and code are the same for all samples of a ray,
+        so they are taken once per ray; the sum is that of the whole layer.
+        """
+        first = self.color_mlp.layers[0]
+        assert isinstance(first, nn.Linear)
+        start, stop = NUM_SPHERICAL_HARMONICS, NUM_SPHERICAL_HARMONICS + self.geo_feature_dim
+        per_ray = torch.nn.functional.linear(
+            spherical_harmonics(directions), first.weight[:, :start], first.bias
+        )
+        if codes is not None:
+            per_ray = per_ray + torch.nn.functional.linear(codes, first.weight[:, stop:])
+        hidden = torch.nn.functional.linear(geometry, first.weight[:, start:stop])
+        return torch.sigmoid(self.color_mlp.tail(hidden + per_ray[:, None, :])).float()
+
+    def codes(self, camera_indices: Tensor) -> Tensor | None:
+        """The appearance codes [R, A] of training images, or None where there are none."""
+        return None if self.appearance is None else self.appearance(camera_indices)
+
+    def mean_code(self) -> Tensor | None:
+        """The mean code [A] of all training images: how the scene looks by default."""
+        return None if self.appearance is None else self.appearance.weight.mean(dim=0)

@@ -1,0 +1,62 @@
+"""A whole density network per tile of samples: hash grid, hidden layer, output; nothing in between.
+
+Used for the proposal networks and for the density half of the field, whose output layer has more
+rows. Forward only. Twin of `fields.DensityField` up to the logit.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+
+from pipelines.nerf.encodings import HashGrid
+from pipelines.nerf.kernels.dense_layers import PackedLayer, apply_layer, pack_layer
+from pipelines.nerf.kernels.hash_grid import encode_points
+from pipelines.nerf.kernels.runtime import compiled
+
+
+class DensityNet(NamedTuple):
+    """A hash grid and the two layers behind it, as arrays that a kernel can take."""
+
+    table: Any
+    resolutions: Any
+    dense: Any
+    offsets: Any
+    hidden: PackedLayer
+    output: PackedLayer
+
+
+def pack_density(grid: HashGrid, layers: nn.ModuleList) -> DensityNet:
+    """The network as arrays: a CPU float32 table is shared, the small layers are copied.
+
+    layers: two `nn.Linear`, L * F -> hidden -> outputs, of which the first is the logit.
+    Raises ValueError for another number of layers or a table that is not float32.
+    """
+    if len(layers) != 2:
+        raise ValueError(f"the compiled density network has 2 layers, this one has {len(layers)}")
+    if grid.table.dtype != torch.float32:
+        raise ValueError(f"the compiled hash grid needs float32, this one is {grid.table.dtype}")
+    hidden, output = layers
+    assert isinstance(hidden, nn.Linear)
+    assert isinstance(output, nn.Linear)
+    return DensityNet(
+        grid.table.detach().cpu().contiguous().numpy(),
+        grid.resolutions.cpu().numpy(),
+        grid.dense.cpu().numpy(),
+        grid.offsets.cpu().numpy(),
+        pack_layer(hidden),
+        pack_layer(output),
+    )
+
+
+@compiled
+def density_logits(net, points, count, features, hidden, out):  # type: ignore[no-untyped-def]
+    """Row 0 of out[O, TILE] becomes the logits at points[:count], the other rows the features.
+
+    points: [TILE, 3] in [0, 1]. features [L * F, TILE] and hidden [H, TILE] are scratch.
+    """
+    encode_points(points, count, net.table, net.resolutions, net.dense, net.offsets, features.T)
+    apply_layer(features, net.hidden, count, True, False, hidden)
+    apply_layer(hidden, net.output, count, False, False, out)

@@ -1,0 +1,297 @@
+"""Fitting a model to images: one loop, top to bottom.
+
+A run is decided by its images, cameras, config and seed. What it needs to go on is in the
+checkpoint, so a resumed run on a CPU ends with the parameters of an uninterrupted one. Which images
+are used and where the files lie is left to the caller.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pipelines.nerf.cameras import Cameras
+from pipelines.nerf.checkpoint import load_checkpoint, save_checkpoint
+from pipelines.nerf.config import OptimizerConfig, TrainConfig, validate
+from pipelines.nerf.data import ImageData, PixelSampler
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.metrics import psnr_from_mse
+from pipelines.nerf.models.nerfacto import Nerfacto, proposals_due
+
+TIMED_STEPS = 50
+STEPS_PER_CUDA_REPORT = 20
+PREVIEWS_PER_RUN = 10
+
+
+@dataclass(frozen=True)
+class TrainProgress:
+    """How far training is, after `step` of `max_steps` steps.
+
+    losses: weighted terms of the last step by name. psnr: of its batch, dB. elapsed_s: training
+    time of all attempts. eta_s: time left at the pace of the last steps, or None before any.
+    """
+
+    step: int
+    max_steps: int
+    losses: dict[str, float]
+    psnr: float
+    elapsed_s: float
+    eta_s: float | None
+    rays_per_s: float
+
+    @property
+    def fraction(self) -> float:
+        """Share of the run that is done, [0, 1]; by time where `max_seconds` ends it."""
+        by_steps = self.step / self.max_steps
+        if self.eta_s is None or self.elapsed_s <= 0.0:
+            return by_steps
+        return max(by_steps, self.elapsed_s / (self.elapsed_s + self.eta_s))
+
+
+def learning_rate(step: int, initial: float, final: float, decay_steps: int) -> float:
+    """exp((1 - t) ln initial + t ln final), t = step / decay_steps in [0, 1]."""
+    t = min(step / decay_steps, 1.0)
+    return math.exp((1.0 - t) * math.log(initial) + t * math.log(final))
+
+
+def choose_device(wanted: str) -> torch.device:
+    """The device for "auto", "cpu" or "cuda". Raises NerfError where CUDA is asked for in vain."""
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise NerfError(
+            "bad_config",
+            "The option train.device is 'cuda', and this machine has no usable GPU.",
+            "Set train.device to auto or cpu.",
+        )
+    if wanted == "auto":
+        wanted = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(wanted)
+
+
+@dataclass
+class _State:
+    """All that changes from step to step."""
+
+    model: Nerfacto
+    optimizers: dict[str, torch.optim.Adam]
+    scaler: torch.amp.GradScaler
+    pixel_random: torch.Generator
+    model_random: torch.Generator
+    step: int = 0
+    steps_since_update: int = 0
+    elapsed_s: float = 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "model": self.model.state_dict(),
+            "optimizers": {name: item.state_dict() for name, item in self.optimizers.items()},
+            "scaler": self.scaler.state_dict(),
+            "pixel_random": self.pixel_random.get_state(),
+            "model_random": self.model_random.get_state(),
+            "step": self.step,
+            "steps_since_update": self.steps_since_update,
+            "elapsed_s": self.elapsed_s,
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        self.model.load_state_dict(saved["model"])
+        for name, item in self.optimizers.items():
+            item.load_state_dict(saved["optimizers"][name])
+        if saved["scaler"] and self.scaler.is_enabled():
+            self.scaler.load_state_dict(saved["scaler"])
+        self.pixel_random.set_state(saved["pixel_random"])
+        if saved["model_random"].shape == self.model_random.get_state().shape:
+            self.model_random.set_state(saved["model_random"])  # else: another kind of device
+        self.step = int(saved["step"])
+        self.steps_since_update = int(saved["steps_since_update"])
+        self.elapsed_s = float(saved["elapsed_s"])
+
+
+def train(
+    images: ImageData,
+    cameras: Cameras,
+    train_indices: Sequence[int],
+    config: TrainConfig,
+    *,
+    seed: int,
+    checkpoint_path: Path | None = None,
+    on_progress: Callable[[TrainProgress], None] = lambda progress: None,
+    on_preview: Callable[[int, Nerfacto], None] = lambda step, model: None,
+    on_checkpoint: Callable[[], None] = lambda: None,
+) -> Nerfacto:
+    """Fit a model; returned in `eval()` on the device it was trained on.
+
+    images, cameras: all N, of the same sizes (`Cameras.resized`). train_indices: those learned
+    from; appearance codes and camera corrections follow this order.
+    seed: decides the start and every draw. checkpoint_path: gone on from where it exists and fits
+    these options, written every `checkpoint_seconds` and at the end.
+    on_progress: after each step on a CPU, every 20th on a GPU; may raise, which ends the run and
+    leaves the last checkpoint as it was. on_preview: step and model in `eval()`, at the preview
+    interval; its time does not count as training. on_checkpoint: a checkpoint is complete.
+    Raises NerfError: bad_config, bad_cameras, bad_checkpoint, too_few_images, non_finite_loss.
+    """
+    validate(config)
+    _check_sizes(images, cameras, train_indices)
+    device = choose_device(config.device)
+    on_gpu = device.type == "cuda"
+    fingerprint = _fingerprint(config, seed, len(train_indices))
+    state = _initial_state(config, len(train_indices), seed, device)
+    if checkpoint_path is not None and checkpoint_path.exists():
+        saved = load_checkpoint(checkpoint_path)
+        if saved["fingerprint"] != fingerprint:
+            raise NerfError(
+                "bad_checkpoint",
+                "The checkpoint belongs to a run with other options, images or seed.",
+                "Remove it to train from the start.",
+            )
+        state.restore(saved)
+    sampler = PixelSampler(images, train_indices)
+    posed = cameras.select(train_indices).to(device)
+    model, parameters = state.model, list(state.model.parameters())
+    preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
+    step_times: deque[float] = deque(maxlen=TIMED_STEPS)
+    last_saved = time.monotonic()
+
+    def save() -> None:
+        if checkpoint_path is not None:
+            save_checkpoint(checkpoint_path, {"fingerprint": fingerprint, **state.as_dict()})
+            on_checkpoint()
+
+    model.train()
+    while state.step < config.max_steps and not _time_is_up(state.elapsed_s, config):
+        started = time.monotonic()
+        step = state.step
+        _set_learning_rates(state.optimizers, config.optimizer, step)
+        state.steps_since_update += 1
+        update = proposals_due(step, state.steps_since_update, config.model)
+
+        index, pixels, colors = sampler.draw(config.rays_per_step, state.pixel_random)
+        index, pixels, colors = index.to(device), pixels.to(device), colors.to(device)
+        with torch.autocast(device.type, dtype=torch.float16, enabled=on_gpu):
+            rays = posed.generate_rays(index, pixels)
+            outputs = model(rays, step=step, update_proposals=update, generator=state.model_random)
+            losses = model.loss_dict(outputs, colors, update_proposals=update)
+        is_reported = not on_gpu or step % STEPS_PER_CUDA_REPORT == 0
+        if is_reported:  # reading a value waits for the GPU
+            values = _checked_values(losses, step)
+        for parameter in parameters:
+            parameter.grad = None  # a parameter without gradient is left alone by Adam
+        state.scaler.scale(torch.stack(list(losses.values())).sum()).backward()
+        for optimizer in state.optimizers.values():
+            state.scaler.step(optimizer)
+        state.scaler.update()
+
+        state.step += 1
+        state.steps_since_update = 0 if update else state.steps_since_update
+        step_times.append(time.monotonic() - started)
+        state.elapsed_s += step_times[-1]
+        if is_reported:
+            on_progress(_progress(state, config, values, step_times))
+        if time.monotonic() - last_saved >= config.checkpoint_seconds:
+            save()
+            last_saved = time.monotonic()
+        if state.step % preview_every == 0:
+            model.eval()
+            with torch.no_grad():
+                on_preview(state.step, model)
+            model.train()
+    save()
+    return model.eval()
+
+
+def _initial_state(config: TrainConfig, num_images: int, seed: int, device: torch.device) -> _State:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = Nerfacto(config.model, num_images).to(device)
+    on_gpu = device.type == "cuda"
+    fast = config.engine == "fast" or (config.engine == "auto" and not on_gpu)
+    model.set_engine("fast" if fast else "plain")
+    networks = [*model.field.parameters(), *model.proposals.parameters()]
+    rates = config.optimizer
+    optimizers = {"networks": torch.optim.Adam(networks, lr=rates.lr, eps=rates.eps, fused=True)}
+    if config.model.camera_mode != "off":
+        optimizers["cameras"] = torch.optim.Adam(
+            model.cameras_delta.parameters(), lr=rates.camera_lr, eps=rates.eps
+        )
+    return _State(
+        model=model,
+        optimizers=optimizers,
+        scaler=torch.amp.GradScaler(device.type, enabled=on_gpu),
+        pixel_random=torch.Generator().manual_seed(seed),
+        model_random=torch.Generator(device).manual_seed(seed + 1),
+    )
+
+
+def _set_learning_rates(
+    optimizers: dict[str, torch.optim.Adam], rates: OptimizerConfig, step: int
+) -> None:
+    wanted = {
+        "networks": learning_rate(step, rates.lr, rates.lr_final, rates.decay_steps),
+        "cameras": learning_rate(
+            step, rates.camera_lr, rates.camera_lr_final, rates.camera_decay_steps
+        ),
+    }
+    for name, optimizer in optimizers.items():
+        for group in optimizer.param_groups:
+            group["lr"] = wanted[name]
+
+
+def _checked_values(losses: dict[str, Tensor], step: int) -> dict[str, float]:
+    values = {name: float(loss.detach()) for name, loss in losses.items()}
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise NerfError(
+                "non_finite_loss",
+                f"The {name} loss became {value} at step {step}.",
+                "Train with a lower train.optimizer.lr, and check the camera poses.",
+            )
+    return values
+
+
+def _time_is_up(elapsed_s: float, config: TrainConfig) -> bool:
+    return config.max_seconds > 0.0 and elapsed_s >= config.max_seconds
+
+
+def _progress(
+    state: _State, config: TrainConfig, losses: dict[str, float], step_times: deque[float]
+) -> TrainProgress:
+    per_step = sum(step_times) / len(step_times)
+    eta_s = (config.max_steps - state.step) * per_step
+    if config.max_seconds > 0.0:
+        eta_s = min(eta_s, max(0.0, config.max_seconds - state.elapsed_s))
+    return TrainProgress(
+        step=state.step,
+        max_steps=config.max_steps,
+        losses=losses,
+        psnr=psnr_from_mse(losses["rgb"]),
+        elapsed_s=state.elapsed_s,
+        eta_s=eta_s,
+        rays_per_s=config.rays_per_step / max(per_step, 1e-9),
+    )
+
+
+def _fingerprint(config: TrainConfig, seed: int, num_images: int) -> str:
+    """What must be the same for a checkpoint to fit. Limits and habits may change in between."""
+    values = asdict(config)
+    for name in ("max_steps", "max_seconds", "checkpoint_seconds", "preview_every_steps", "device"):
+        del values[name]
+    return json.dumps({"config": values, "seed": seed, "num_images": num_images}, sort_keys=True)
+
+
+def _check_sizes(images: ImageData, cameras: Cameras, train_indices: Sequence[int]) -> None:
+    if not train_indices:
+        raise NerfError("too_few_images", "There is no image to train on.", "Send more images.")
+    if len(images) != len(cameras) or not torch.equal(images.sizes, cameras.size.cpu()):
+        raise NerfError(
+            "bad_cameras",
+            "Images and cameras differ in number or size.",
+            "Load the images at the size of the cameras (Cameras.resized).",
+        )

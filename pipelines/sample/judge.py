@@ -1,0 +1,160 @@
+"""How far poses and a mesh made from the sample are from the truth.
+
+Poses are aligned to the true cameras by a similarity of the camera centres; the mesh is moved by
+that same similarity and nothing else, so a wrong scale or a tilt shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.cameras_file import CamerasFile, PosedImage
+from pipelines.sample.align import Floats, Similarity, path_extent, similarity
+from pipelines.sample.scene import SUBJECT, Region, pose_matrix, seen_surface, surface_distance
+
+
+@dataclass(frozen=True)
+class PosesJudgement:
+    """num_images: how many were compared. mean_center_error, max_center_error: relative to the
+    extent of the true path. mean_rotation_error_deg: angle between the aligned and true cameras.
+    alignment: from the judged frame to the true world.
+    """
+
+    num_images: int
+    mean_center_error: float
+    max_center_error: float
+    mean_rotation_error_deg: float
+    alignment: Similarity
+
+
+@dataclass(frozen=True)
+class MeshJudgement:
+    """Median distances relative to the region's size.
+
+    accuracy: from the mesh to the true surface. completeness: from the true surface to the mesh.
+    num_mesh_points, num_true_points: how many points they are medians of.
+    """
+
+    accuracy: float
+    completeness: float
+    num_mesh_points: int
+    num_true_points: int
+
+
+def judge_poses(cameras: CamerasFile, truth: CamerasFile) -> PosesJudgement:
+    """Compare cameras with the true ones, image by image, paired by timestamp.
+
+    Raises ValueError for an image without a timestamp or with none of the truth within half a
+    frame, and where fewer than 3 images are left.
+    """
+    pairs = [(image, _true_image(image, truth)) for image in cameras.images]
+    if len(pairs) < 3:
+        raise ValueError(f"poses of {len(pairs)} images cannot be judged: at least 3 are needed")
+    found = np.array([pose_matrix(image) for image, _ in pairs])
+    true = np.array([pose_matrix(image) for _, image in pairs])
+    alignment = similarity(found[:, :, 3], true[:, :, 3])
+    extent = path_extent(np.array([pose_matrix(image)[:, 3] for image in truth.images]))
+    errors = np.linalg.norm(alignment.apply(found[:, :, 3]) - true[:, :, 3], axis=1) / extent
+    turned = np.einsum("ij,njk,nlk->nil", alignment.rotation, found[:, :, :3], true[:, :, :3])
+    cosines = (np.trace(turned, axis1=1, axis2=2) - 1.0) / 2.0
+    return PosesJudgement(
+        num_images=len(pairs),
+        mean_center_error=float(errors.mean()),
+        max_center_error=float(errors.max()),
+        mean_rotation_error_deg=float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).mean()),
+        alignment=alignment,
+    )
+
+
+def _true_image(image: PosedImage, truth: CamerasFile) -> PosedImage:
+    if image.timestamp_s is None:
+        raise ValueError(f"{image.file} has no timestamp: it cannot be paired with the truth")
+    times = np.array([np.nan if i.timestamp_s is None else i.timestamp_s for i in truth.images])
+    index = int(np.nanargmin(np.abs(times - image.timestamp_s)))
+    half_frame = 0.5 * float(np.nanmedian(np.diff(times)))
+    if abs(times[index] - image.timestamp_s) > half_frame:
+        raise ValueError(
+            f"{image.file} at {image.timestamp_s:.3f} s has no true camera within half a frame"
+        )
+    return truth.images[index]
+
+
+def judge_mesh(
+    vertices: Floats,
+    faces: NDArray[np.integer],
+    alignment: Similarity,
+    truth: CamerasFile,
+    region: Region = SUBJECT,
+    num_points: int = 20_000,
+) -> MeshJudgement:
+    """Compare a mesh with the true surface, both ways, within what the cameras saw of `region`.
+
+    vertices: [V, 3], in the frame that `alignment` moves to the true world. faces: [F, 3].
+    Accuracy takes points spread evenly over the mesh that lie in the region and in a camera's
+    view; completeness takes true points that cameras saw.
+    Raises ValueError for a mesh without faces, or none of it where the cameras looked.
+    """
+    if len(faces) == 0:
+        raise ValueError("a mesh without faces cannot be judged")
+    moved = alignment.apply(np.asarray(vertices, dtype=np.float64))
+    points = _points_on_mesh(moved, faces, num_points)
+    points = points[region.contains(points)]
+    points = points[_in_view(points, truth)]
+    if len(points) == 0:
+        raise ValueError("no part of the mesh lies where the cameras looked")
+    true_points = seen_surface(truth, region, num_points)
+    return MeshJudgement(
+        accuracy=float(np.median(surface_distance(points))) / region.size,
+        completeness=float(np.median(_distance_to_mesh(true_points, moved, faces))) / region.size,
+        num_mesh_points=len(points),
+        num_true_points=len(true_points),
+    )
+
+
+def _points_on_mesh(vertices: Floats, faces: NDArray[np.integer], num_points: int) -> Floats:
+    """Points spread over the faces by area, [num_points, 3]; the same ones on every call."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    if not areas.sum() > 0.0:
+        raise ValueError("a mesh without area cannot be judged")
+    random = np.random.default_rng(0)
+    chosen = corners[random.choice(len(faces), size=num_points, p=areas / areas.sum())]
+    a, b = random.random((2, num_points, 1))
+    root = np.sqrt(a)
+    points: Floats = (
+        (1.0 - root) * chosen[:, 0] + root * (1.0 - b) * chosen[:, 1] + root * b * chosen[:, 2]
+    )
+    return points
+
+
+def _in_view(points: Floats, truth: CamerasFile) -> NDArray[np.bool_]:
+    """Which points [N, 3] project into a true picture, hidden or not: [N]."""
+    seen = np.zeros(len(points), dtype=np.bool_)
+    for image in truth.images:
+        camera, pose = truth.cameras[image.camera], pose_matrix(image)
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        depth = np.maximum(-local[:, 2], 1e-9)
+        x = camera.cx + camera.fl_x * local[:, 0] / depth
+        y = camera.cy - camera.fl_y * local[:, 1] / depth
+        inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+        seen |= inside & (local[:, 2] < 0)
+    return seen
+
+
+def _distance_to_mesh(points: Floats, vertices: Floats, faces: NDArray[np.integer]) -> Floats:
+    """Exact distance of points [N, 3] to the nearest triangle, [N]."""
+    import open3d  # takes a second to import, and only meshes need it
+
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        open3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+        open3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
+    )
+    distances = scene.compute_distance(
+        open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
+    )
+    return np.asarray(distances.numpy(), dtype=np.float64)

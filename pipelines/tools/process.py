@@ -1,0 +1,261 @@
+"""Run another program: argument lists only, a time limit, a cancel check, and its last log lines.
+
+A started program stays in the process group of the process that starts it, so whoever kills that
+group (a worker ending its stage process, or Ctrl-C in a terminal) takes the program along; nothing
+is orphaned in a session of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TypeVar
+
+from pipelines.errors import Cancelled, ToolError
+
+LOG_LINES = 40
+"""How many of a program's last lines are kept for its error."""
+
+_POLL_S = 0.1
+_CHUNK_BYTES = 1 << 20
+
+_SIGNAL_ADVICE: Mapping[int, str] = {
+    signal.SIGKILL: "The system probably ran out of memory: use smaller pictures or a larger "
+    "machine.",
+    signal.SIGILL: "The program was built for another processor: install a build for this one.",
+    signal.SIGSEGV: "The program has a fault: try the input converted to another format.",
+    signal.SIGABRT: "The program has a fault: try the input converted to another format.",
+}
+_NO_LIMIT = float("inf")
+_Value = TypeVar("_Value")
+
+
+@dataclass(frozen=True)
+class ProgramResult:
+    """A program that ended well. log: its last stderr lines. wall_s: how long it ran."""
+
+    log: tuple[str, ...]
+    wall_s: float
+
+
+def _never() -> bool:
+    return False
+
+
+def exit_advice(returncode: int, advice: Mapping[int, str]) -> str | None:
+    """What to do about an exit code, or None where nothing is known.
+
+    A negative code is the signal that ended the program; shells report it as 128 + signal.
+    """
+    if returncode in advice:
+        return advice[returncode]
+    number = -returncode if returncode < 0 else returncode - 128
+    return _SIGNAL_ADVICE.get(number)
+
+
+class Program:
+    """A running program, as a context: whatever happens inside, it is gone afterwards.
+
+    argv: the program and its arguments, never a shell string.
+    on_line: called with each stderr line. on_stdout: called with each chunk of stdout; without it
+    stdout is dropped. Both are called in threads of their own; what they raise, `wait` raises.
+    stdin: whether `write` will be used.
+    is_cancelled: polled in `write` and `wait`; once true the program is killed.
+    advice: what to do about exit codes of this program.
+    Raises ToolError where the program cannot be started.
+    """
+
+    def __init__(
+        self,
+        argv: Sequence[str],
+        *,
+        time_limit_s: float = _NO_LIMIT,
+        is_cancelled: Callable[[], bool] = _never,
+        on_line: Callable[[str], None] | None = None,
+        on_stdout: Callable[[bytes], None] | None = None,
+        stdin: bool = False,
+        advice: Mapping[int, str] | None = None,
+    ) -> None:
+        self._argv = list(argv)
+        self._name = Path(self._argv[0]).name
+        self._time_limit_s = time_limit_s
+        self._is_cancelled = is_cancelled
+        self._on_line = on_line
+        self._on_stdout = on_stdout
+        self._wants_stdin = stdin
+        self._advice = dict(advice or {})
+        self._log: deque[str] = deque(maxlen=LOG_LINES)
+        self._callback_errors: list[Exception] = []
+        self._timed_out = threading.Event()
+
+    def __enter__(self) -> Program:
+        try:
+            self._process: subprocess.Popen[bytes] = subprocess.Popen(
+                self._argv,
+                stdin=subprocess.PIPE if self._wants_stdin else subprocess.DEVNULL,
+                stdout=subprocess.PIPE if self._on_stdout else subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+            )
+        except OSError as error:
+            raise ToolError(
+                f"{self._name} cannot be started: {os.strerror(error.errno or 0)}.",
+                code="tool_missing",
+                hint=f"Install {self._name}, or repair its installation.",
+            ) from error
+        self._started = time.monotonic()
+        self._threads = [threading.Thread(target=self._read_log, daemon=True)]
+        if self._on_stdout:
+            self._threads.append(threading.Thread(target=self._read_stdout, daemon=True))
+        for thread in self._threads:
+            thread.start()
+        self._timer: threading.Timer | None = None
+        if self._time_limit_s != _NO_LIMIT:
+            self._timer = threading.Timer(self._time_limit_s, self._on_time_limit)
+            self._timer.daemon = True
+            self._timer.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._kill()
+        if self._timer:
+            self._timer.cancel()
+        for thread in self._threads:
+            thread.join()
+        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
+            if pipe:
+                _close_quietly(pipe)
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Feed the program's stdin. Raises ToolError where it has ended, and Cancelled."""
+        self._check_cancelled()
+        assert self._process.stdin is not None, "the program was started without stdin"
+        try:
+            self._process.stdin.write(data)
+        except BrokenPipeError:
+            self.wait()
+            raise ToolError(
+                f"{self._name} ended before it had read all of its input.",
+                details={"log": list(self._log)},
+            ) from None
+
+    def wait(self) -> ProgramResult:
+        """Close stdin and wait for the end.
+
+        Raises ToolError for an exit code other than 0 or a passed time limit, Cancelled, and what
+        a callback raised.
+        """
+        if self._process.stdin:
+            _close_quietly(self._process.stdin)
+        while True:
+            try:
+                returncode = self._process.wait(_POLL_S)
+                break
+            except subprocess.TimeoutExpired:
+                self._check_cancelled()
+        for thread in self._threads:
+            thread.join()
+        if self._callback_errors:
+            raise self._callback_errors[0]
+        self._raise_for(returncode)
+        return ProgramResult(tuple(self._log), time.monotonic() - self._started)
+
+    def _raise_for(self, returncode: int) -> None:
+        log = list(self._log)
+        if self._timed_out.is_set():
+            raise ToolError(
+                f"{self._name} was stopped: it took longer than {self._time_limit_s:.0f} s.",
+                code="tool_timeout",
+                hint="Try a shorter or smaller input.",
+                details={"log": log},
+            )
+        if returncode != 0:
+            last = next((line for line in reversed(log) if line.strip()), "it said nothing")
+            how = f"signal {-returncode}" if returncode < 0 else f"exit code {returncode}"
+            raise ToolError(
+                f"{self._name} failed with {how}: {last.strip()}",
+                hint=exit_advice(returncode, self._advice),
+                details={"log": log, "exit_code": returncode},
+            )
+
+    def _check_cancelled(self) -> None:
+        if self._is_cancelled():
+            self._kill()
+            raise Cancelled(f"The job was cancelled while {self._name} was running.")
+
+    def _on_time_limit(self) -> None:
+        if self._process.poll() is None:
+            self._timed_out.set()
+            self._kill()
+
+    def _kill(self) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+
+    def _read_log(self) -> None:
+        assert self._process.stderr is not None
+        # Programs redraw a progress line with \r: iterating in universal newlines splits there.
+        with open(
+            self._process.stderr.fileno(), encoding="utf-8", errors="replace", closefd=False
+        ) as lines:
+            for line in lines:
+                self._log.append(line.rstrip("\n"))
+                self._call(self._on_line, line.rstrip("\n"))
+
+    def _read_stdout(self) -> None:
+        assert self._process.stdout is not None
+        descriptor = self._process.stdout.fileno()
+        while chunk := os.read(descriptor, _CHUNK_BYTES):
+            self._call(self._on_stdout, chunk)
+
+    def _call(self, callback: Callable[[_Value], None] | None, value: _Value) -> None:
+        """Call back; after a first failure the program is ended and the rest only drained."""
+        if callback is None or self._callback_errors:
+            return
+        try:
+            callback(value)
+        except Exception as error:  # noqa: BLE001  carried to the caller's thread, raised there
+            self._callback_errors.append(error)
+            self._process.kill()
+
+
+def _close_quietly(pipe: IO[bytes]) -> None:
+    """Close a pipe whose other end may be gone."""
+    try:
+        pipe.close()
+    except BrokenPipeError:
+        return
+
+
+def run_program(
+    argv: Sequence[str],
+    *,
+    time_limit_s: float = _NO_LIMIT,
+    is_cancelled: Callable[[], bool] = _never,
+    on_line: Callable[[str], None] | None = None,
+    on_stdout: Callable[[bytes], None] | None = None,
+    advice: Mapping[int, str] | None = None,
+) -> ProgramResult:
+    """Run a program to its end; the arguments and errors are those of `Program`."""
+    with Program(
+        argv,
+        time_limit_s=time_limit_s,
+        is_cancelled=is_cancelled,
+        on_line=on_line,
+        on_stdout=on_stdout,
+        advice=advice,
+    ) as program:
+        return program.wait()

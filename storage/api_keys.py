@@ -1,0 +1,63 @@
+"""The API's keys: 256 random bits each, of which the database holds the SHA-256 alone."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from datetime import datetime, timedelta
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from storage.db import now
+from storage.errors import NotFoundError
+from storage.models import ApiKey
+
+KEY_PREFIX = "nw_"
+_USED_GRAIN = timedelta(minutes=1)  # last_used_at moves no oftener: a read should rarely write
+
+
+def _digest(key: str) -> str:
+    return hashlib.sha256(key.encode("utf-8", "replace")).hexdigest()
+
+
+def create_api_key(session: Session, name: str) -> tuple[ApiKey, str]:
+    """Make a key. The second value is the key itself, which cannot be shown again."""
+    key = KEY_PREFIX + secrets.token_urlsafe(32)
+    return ensure_api_key(session, key, name), key
+
+
+def ensure_api_key(session: Session, key: str, name: str) -> ApiKey:
+    """The record of a key that was made elsewhere, made where there is none."""
+    found = session.scalar(select(ApiKey).where(ApiKey.sha256 == _digest(key)))
+    if found is None:
+        found = ApiKey(sha256=_digest(key), name=name, created_at=now(session))
+        session.add(found)
+        session.flush()
+    return found
+
+
+def find_api_key(session: Session, key: str) -> ApiKey | None:
+    """The record of a key that is valid, or None for one that is unknown or revoked."""
+    query = select(ApiKey).where(ApiKey.sha256 == _digest(key), ApiKey.revoked_at.is_(None))
+    return session.scalar(query)
+
+
+def is_use_due(record: ApiKey, when: datetime) -> bool:
+    """Whether `touch_api_key` is worth a write."""
+    return record.last_used_at is None or when - record.last_used_at > _USED_GRAIN
+
+
+def touch_api_key(session: Session, key_id: str) -> None:
+    """Note that a key was used."""
+    record = session.get(ApiKey, key_id)
+    if record is not None:
+        record.last_used_at = now(session)
+
+
+def revoke_api_key(session: Session, key_id: str) -> None:
+    """Make a key invalid. Raises NotFoundError."""
+    record = session.get(ApiKey, key_id)
+    if record is None:
+        raise NotFoundError("API key", key_id)
+    record.revoked_at = record.revoked_at or now(session)

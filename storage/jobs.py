@@ -1,0 +1,137 @@
+"""A job's life: create, cancel, delete. `storage.leases` has what workers do to its stages.
+
+Callers commit, and ring the bell (`storage.queue`) for stages that became ready after the commit.
+Reading is in `storage.queries`. `when` is for tests; it defaults to the database's clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import delete
+from sqlalchemy.orm import Session
+
+from storage.db import now
+from storage.errors import ConflictError, NotFoundError
+from storage.keys import job_prefix
+from storage.models import Capture, Event, Job, LogLine, PendingDeletion, StageRow, new_id
+from storage.transitions import drop_waiting, lock_job, record_event, set_job, settle
+
+MAX_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class StageSeed:
+    """A stage as the job's creator names it. `after`: names of stages earlier in the list."""
+
+    name: str
+    after: tuple[str, ...]
+    needs_gpu: bool = False
+    skipped: bool = False
+
+
+def stage_id(job_id: str, name: str) -> str:
+    """The id of a stage's row: all that a message carries."""
+    return f"{job_id}-{name}"
+
+
+def create_job(
+    session: Session,
+    *,
+    capture_id: str,
+    preset: str,
+    preset_reason: str,
+    options: dict[str, Any],
+    stages: Sequence[StageSeed],
+    labels: dict[str, str] | None = None,
+    seed: int = 0,
+    max_attempts: int = MAX_ATTEMPTS,
+    when: datetime | None = None,
+) -> Job:
+    """Record a job and its stages; those with nothing to wait for are `ready`.
+
+    Ring for `ready_stage_ids(job)` after the commit. Raises NotFoundError for an unknown or
+    deleted capture, ValueError for stages that nothing could start.
+    """
+    when = when or now(session)
+    capture = session.get(Capture, capture_id, with_for_update={"read": True})
+    if capture is None or capture.deleted_at is not None:
+        raise NotFoundError("capture", capture_id)
+    names = [stage.name for stage in stages]
+    for position, stage in enumerate(stages):
+        if not set(stage.after) <= set(names[:position]):
+            raise ValueError(f"stage {stage.name} waits for a stage that is not before it")
+    job = Job(
+        id=new_id(),
+        capture_id=capture_id,
+        state="queued",
+        preset=preset,
+        preset_reason=preset_reason,
+        options=options,
+        labels=labels or {},
+        seed=seed,
+        created_at=when,
+    )
+    session.add(job)
+    session.flush()
+    rows = [
+        StageRow(
+            id=stage_id(job.id, stage.name),
+            job_id=job.id,
+            name=stage.name,
+            seq=position,
+            after=list(stage.after),
+            state="skipped" if stage.skipped else "blocked",
+            needs_gpu=stage.needs_gpu,
+            max_attempts=max_attempts,
+            lease_token=0,
+            attempt=0,
+            crashes=0,
+            progress=0.0,
+            message="",
+        )
+        for position, stage in enumerate(stages)
+    ]
+    session.add_all(rows)
+    record_event(session, job.id, "job.queued", when)
+    session.flush()
+    if not settle(session, job, rows, when):
+        raise ValueError("a job needs at least one stage that can start")
+    return job
+
+
+def ready_stage_ids(job: Job) -> list[str]:
+    """The stages of a loaded job that can start now."""
+    return [row.id for row in job.stages if row.state == "ready"]
+
+
+def request_cancel(session: Session, job_id: str, when: datetime | None = None) -> Job:
+    """Ask a job to stop; a second request, or one for a finished job, changes nothing.
+
+    The job is `cancelled` at once where no stage runs, else `cancelling` until it has stopped.
+    """
+    job, stages = lock_job(session, job_id)
+    when = when or now(session)
+    if job.state in ("queued", "running"):
+        drop_waiting(session, stages, when)
+        running = any(row.state == "running" for row in stages)
+        state = "cancelling" if running else "cancelled"
+        set_job(session, job, state, when, cancel_requested_at=when)
+    return job
+
+
+def delete_job(session: Session, job_id: str, when: datetime | None = None) -> None:
+    """Delete a job's records and put its bytes up for deletion (`storage.deletions`).
+
+    A queued job is dropped. Raises ConflictError while it runs or a stage of it has not stopped.
+    """
+    job, stages = lock_job(session, job_id)
+    if job.state in ("running", "cancelling") or any(row.state == "running" for row in stages):
+        raise ConflictError(f"Job {job_id} is {job.state}; cancel it first.")
+    for record in (Event, LogLine, StageRow):
+        session.execute(delete(record).where(record.job_id == job_id))
+    session.add(PendingDeletion(prefix=job_prefix(job_id), created_at=when or now(session)))
+    session.execute(delete(Job).where(Job.id == job_id))

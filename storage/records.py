@@ -1,0 +1,160 @@
+"""Captures, workers and log lines: records without a state machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+from sqlalchemy import delete, func, insert, select
+from sqlalchemy.orm import Session
+
+from storage.db import clean_text, now
+from storage.errors import ConflictError, NotFoundError
+from storage.keys import capture_prefix
+from storage.leases import Claim
+from storage.models import Capture, Job, LogLine, PendingDeletion, Worker
+from storage.states import JOB_LIVE
+
+WORKER_LIVE_S = 60.0
+MAX_LOG_LINES = 20_000
+MAX_LINE_CHARS = 2_000
+
+
+@dataclass(frozen=True)
+class LogPage:
+    """Lines of a job. first: the number of the first one, from 0. total: lines there are."""
+
+    lines: list[str]
+    first: int
+    total: int
+
+
+def create_capture(
+    session: Session,
+    *,
+    capture_id: str,
+    filename: str,
+    kind: str,
+    num_bytes: int,
+    sha256: str,
+    object_key: str,
+    details: dict[str, Any],
+    when: datetime | None = None,
+) -> Capture:
+    """Record uploaded bytes that are in the object store already."""
+    capture = Capture(
+        id=capture_id,
+        filename=filename,
+        kind=kind,
+        bytes=num_bytes,
+        sha256=sha256,
+        object_key=object_key,
+        details=details,
+        created_at=when or now(session),
+    )
+    session.add(capture)
+    session.flush()
+    return capture
+
+
+def get_capture(session: Session, capture_id: str) -> Capture:
+    """A capture that was not deleted. Raises NotFoundError."""
+    capture = session.get(Capture, capture_id)
+    if capture is None or capture.deleted_at is not None:
+        raise NotFoundError("capture", capture_id)
+    return capture
+
+
+def delete_capture(session: Session, capture_id: str, when: datetime | None = None) -> None:
+    """Delete a capture and put its bytes up for deletion (`storage.deletions`).
+
+    Finished jobs keep their results. Raises ConflictError while a job on it is not over.
+    """
+    capture = session.get(Capture, capture_id, with_for_update=True, populate_existing=True)
+    if capture is None or capture.deleted_at is not None:
+        raise NotFoundError("capture", capture_id)
+    live = select(func.count()).select_from(Job)
+    live = live.where(Job.capture_id == capture_id, Job.state.in_(JOB_LIVE))
+    if session.scalars(live).one():
+        raise ConflictError(f"A job is running on capture {capture_id}; cancel it first.")
+    when = when or now(session)
+    capture.deleted_at = when
+    session.add(PendingDeletion(prefix=capture_prefix(capture_id), created_at=when))
+
+
+def register_worker(
+    session: Session,
+    worker_id: str,
+    *,
+    hostname: str,
+    pid: int,
+    queues: Sequence[str],
+    slots: int,
+    has_gpu: bool,
+    when: datetime | None = None,
+) -> None:
+    """Record, or refresh, what a worker has."""
+    when = when or now(session)
+    row = session.get(Worker, worker_id)
+    if row is None or row.pid != pid or row.hostname != hostname:
+        if row is not None:
+            session.delete(row)
+            session.flush()
+        row = Worker(id=worker_id, started_at=when)
+        session.add(row)
+    row.hostname, row.pid, row.queues = hostname, pid, list(queues)
+    row.slots, row.has_gpu, row.seen_at = slots, has_gpu, when
+
+
+def forget_worker(session: Session, worker_id: str) -> None:
+    """A worker ends in order."""
+    session.execute(delete(Worker).where(Worker.id == worker_id))
+
+
+def live_workers(session: Session, when: datetime | None = None) -> list[Worker]:
+    """The workers that were seen within the last minute."""
+    edge = (when or now(session)) - timedelta(seconds=WORKER_LIVE_S)
+    return list(session.scalars(select(Worker).where(Worker.seen_at >= edge).order_by(Worker.id)))
+
+
+def has_live_gpu(session: Session, when: datetime | None = None) -> bool:
+    """Whether a live worker has a GPU and serves the queue `gpu`."""
+    return any(worker.has_gpu and "gpu" in worker.queues for worker in live_workers(session, when))
+
+
+def append_logs(
+    session: Session, claim: Claim, lines: Sequence[str], when: datetime | None = None
+) -> int:
+    """Add lines that a stage wrote, up to MAX_LOG_LINES a stage. Returns how many were kept."""
+    mine = (LogLine.job_id == claim.job_id, LogLine.stage == claim.name)
+    held = session.scalars(select(func.count()).select_from(LogLine).where(*mine)).one()
+    room = max(MAX_LOG_LINES - held, 0)
+    kept = [clean_text(line, MAX_LINE_CHARS) for line in lines[:room]]
+    if kept and len(kept) == room:
+        kept[-1] = f"[the log ends here: {MAX_LOG_LINES} lines are kept of a stage]"
+    if kept:
+        moment = when or now(session)
+        common = {
+            "job_id": claim.job_id,
+            "stage": claim.name,
+            "attempt": claim.attempt,
+            "created_at": moment,
+        }
+        session.execute(insert(LogLine), [{**common, "text": text} for text in kept])
+    return len(kept)
+
+
+def read_logs(
+    session: Session, job_id: str, *, stage: str | None = None, line: int = 0, limit: int = 1000
+) -> LogPage:
+    """Lines from number `line` on, of all stages or of one; a negative `line` counts from the end."""
+    conditions = [LogLine.job_id == job_id]
+    if stage is not None:
+        conditions.append(LogLine.stage == stage)
+    total = session.scalars(select(func.count()).select_from(LogLine).where(*conditions)).one()
+    first = max(total + line, 0) if line < 0 else min(line, total)
+    query = select(LogLine.text).where(*conditions).order_by(LogLine.id)
+    lines = list(session.scalars(query.offset(first).limit(limit)))
+    return LogPage(lines, first, total)

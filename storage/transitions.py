@@ -1,0 +1,130 @@
+"""How a state changes: the one mechanism under `storage.jobs` and `storage.leases`.
+
+Every change locks the job's row first (on SQLite a writing session holds the whole file), names
+the old state and the fencing token in its UPDATE, is checked against `storage.states`, and records
+an event in the same transaction. Only those two modules use this one.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, cast
+
+from sqlalchemy import CursorResult, select, update
+from sqlalchemy.orm import Session
+
+from storage.errors import ConflictError, LostLeaseError, NotFoundError
+from storage.models import Event, Job, StageRow
+from storage.states import JOB_TERMINAL, STAGE_DONE, check_transition
+
+
+def record_event(
+    session: Session, job_id: str, kind: str, when: datetime, stage: str | None = None, **data: Any
+) -> None:
+    session.add(Event(job_id=job_id, stage=stage, kind=kind, data=data, created_at=when))
+
+
+def lock_job(session: Session, job_id: str) -> tuple[Job, list[StageRow]]:
+    """The job, locked until the transaction ends, and its stages as they are now."""
+    fresh = {"populate_existing": True}
+    job = session.scalars(
+        select(Job).where(Job.id == job_id).with_for_update(), execution_options=fresh
+    ).one_or_none()
+    if job is None:
+        raise NotFoundError("job", job_id)
+    stages = session.scalars(
+        select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.seq),
+        execution_options=fresh,
+    ).all()
+    return job, list(stages)
+
+
+def set_stage(session: Session, row: StageRow, state: str, when: datetime, **values: Any) -> None:
+    """Compare-and-set on state and token; drops the lease where the stage leaves `running`."""
+    check_transition("stage", row.state, state)
+    old, data = row.state, {"attempt": values.get("attempt", row.attempt)}
+    if old == "running":
+        values |= {"lease_owner": None, "lease_until": None, "eta_s": None}
+    if state == "ready":
+        values.setdefault("ready_at", when)
+        values.setdefault("rung_at", None)
+    if state in ("succeeded", "failed", "cancelled"):
+        values.setdefault("finished_at", when)
+    statement = (
+        update(StageRow)
+        .where(
+            StageRow.id == row.id,
+            StageRow.state == old,
+            StageRow.lease_token == row.lease_token,
+        )
+        .values(state=state, **values)
+    )
+    if cast("CursorResult[Any]", session.execute(statement)).rowcount != 1:
+        raise LostLeaseError(f"stage {row.id} is no longer {old}")
+    if values.get("error"):
+        data["error"] = values["error"]
+    record_event(session, row.job_id, f"stage.{state}", when, row.name, was=old, **data)
+
+
+def set_job(session: Session, job: Job, state: str, when: datetime, **values: Any) -> None:
+    check_transition("job", job.state, state)
+    old = job.state
+    if state in JOB_TERMINAL:
+        values.setdefault("finished_at", when)
+    statement = update(Job).where(Job.id == job.id, Job.state == old)
+    result = session.execute(statement.values(state=state, **values))
+    if cast("CursorResult[Any]", result).rowcount != 1:
+        raise ConflictError(f"job {job.id} is no longer {old}")
+    record_event(session, job.id, f"job.{state}", when, was=old)
+
+
+def _is_done(name: str, by_name: dict[str, StageRow]) -> bool:
+    """Succeeded; or skipped, with all that it waits for done: a skipped stage passes through."""
+    row = by_name[name]
+    if row.state == "skipped":
+        return all(_is_done(earlier, by_name) for earlier in row.after)
+    return row.state in STAGE_DONE
+
+
+def settle(session: Session, job: Job, stages: list[StageRow], when: datetime) -> list[str]:
+    """Draw the consequences for the job: unblock, succeed, finish a cancel. Ids newly ready."""
+    if job.state == "cancelling":
+        if not any(row.state == "running" for row in stages):
+            set_job(session, job, "cancelled", when)
+        return []
+    if job.state in JOB_TERMINAL:
+        return []
+    by_name = {row.name: row for row in stages}
+    ready = [
+        row
+        for row in stages
+        if row.state == "blocked" and all(_is_done(earlier, by_name) for earlier in row.after)
+    ]
+    for row in ready:
+        set_stage(session, row, "ready", when)
+    if job.state == "running" and all(row.state in STAGE_DONE for row in stages):
+        set_job(session, job, "succeeded", when)
+    return [row.id for row in ready]
+
+
+def drop_waiting(session: Session, stages: list[StageRow], when: datetime) -> None:
+    for row in stages:
+        if row.state in ("blocked", "ready"):
+            set_stage(session, row, "cancelled", when)
+
+
+def fail_for_good(
+    session: Session,
+    job: Job,
+    stages: list[StageRow],
+    row: StageRow,
+    error: dict[str, Any],
+    when: datetime,
+    **values: Any,
+) -> None:
+    """The stage and, unless it ends otherwise already, the job fail; what waits is dropped."""
+    set_stage(session, row, "failed", when, error=error, **values)
+    if job.state == "running":
+        set_job(session, job, "failed", when, error={**error, "stage": row.name})
+        drop_waiting(session, stages, when)
+    settle(session, job, stages, when)
