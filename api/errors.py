@@ -51,10 +51,11 @@ logger = logging.getLogger("nerfworks.api")
 PROBLEM_TYPE = "application/problem+json"
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _CAPTURE_STATUS = {"too_large": 413, "archive_bomb": 413, "unknown_type": 415}
-_FRAMEWORK_CODES = {404: "not_found", 405: "method_not_allowed"}
+_FRAMEWORK_CODES = {404: "not_found", 405: "method_not_allowed", 413: "too_large"}
 _FRAMEWORK_HINTS = {
     404: "Check the address; /docs lists every call.",
     405: "Use one of the methods that the Allow header names.",
+    413: "Send less: only an upload to /v1/captures may be large.",
 }
 
 
@@ -225,8 +226,34 @@ class RequestGuard:
             await answer(scope, receive, send_with_id)
 
 
-def install(app: FastAPI) -> None:
-    """Register the handlers and the guard."""
+class BodyLimit:
+    """Refuses bodies that are too large for what is no upload, before they are held in memory."""
+
+    def __init__(self, app: ASGIApp, max_bytes: int, upload_path: str) -> None:
+        self.app = app
+        self.max_bytes = max_bytes
+        self.upload_path = upload_path
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI entry."""
+        if scope["type"] != "http" or scope["path"] == self.upload_path:
+            await self.app(scope, receive, send)
+            return
+        taken = 0
+
+        async def receive_bounded() -> Message:
+            nonlocal taken
+            message = await receive()
+            taken += len(message.get("body", b""))
+            if taken > self.max_bytes:
+                raise HTTPException(413)
+            return message
+
+        await self.app(scope, receive_bounded, send)
+
+
+def install(app: FastAPI, *, max_body_bytes: int, upload_path: str) -> None:
+    """Register the handlers and the guards."""
     handler: Callable[[Request, Any], Awaitable[Response]] = _handle
     for kind in (
         ApiError,
@@ -241,4 +268,5 @@ def install(app: FastAPI) -> None:
         OSError,
     ):
         app.add_exception_handler(kind, handler)
+    app.add_middleware(BodyLimit, max_bytes=max_body_bytes, upload_path=upload_path)
     app.add_middleware(RequestGuard)

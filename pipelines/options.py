@@ -28,7 +28,13 @@ class IngestOptions(StageOptions):
     """Limits on what is accepted."""
 
     max_duration_s: float = Field(1800.0, gt=0, le=86400, description="Longest video, in seconds.")
-    max_images: int = Field(5000, ge=1, le=100_000, description="Most images in an archive.")
+    max_images: int = Field(5000, ge=3, le=100_000, description="Most images in an archive.")
+    max_posed_images: int = Field(
+        600,
+        ge=3,
+        le=100_000,
+        description="Images used of a Polycam or Record3D export, evenly picked.",
+    )
     max_pixels: int = Field(
         200_000_000, ge=10_000, le=10**9, description="Most pixels in one image."
     )

@@ -66,7 +66,8 @@ class Normalisation:
 
 def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
     """[N, 3, 4] with OpenCV camera axes to the same poses with OpenGL camera axes."""
-    return world_from_camera_opencv * np.array([1.0, -1.0, -1.0, 1.0])
+    flipped: Array = world_from_camera_opencv * np.array([1.0, -1.0, -1.0, 1.0])
+    return flipped
 
 
 def find_up(world_from_camera: Array) -> tuple[Array, str]:
@@ -121,10 +122,9 @@ def rotation_to_z(up: Array) -> Array:
     if cosine < -1.0 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
     axis = np.cross(up, target)
-    cross = np.array(
-        [[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]]
-    )
-    return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    rotation: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    return rotation
 
 
 def find_focus(world_from_camera: Array) -> Array | None:
@@ -170,9 +170,7 @@ def normalise(world_from_camera: Array, *, orient: bool = True) -> Normalisation
     center = centers.mean(axis=0) if focus is None else focus
     reach = float(np.abs((centers - center) @ rotation.T).max(initial=0.0))
     scale = 1.0 / reach if reach > 1e-12 else 1.0
-    similarity = Similarity(
-        rotation=rotation, translation=-scale * rotation @ center, scale=scale
-    )
+    similarity = Similarity(rotation=rotation, translation=-scale * rotation @ center, scale=scale)
     return Normalisation(similarity, up_from, "centers" if focus is None else "focus")
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ToolError
-from pipelines.tools.ffmpeg import ffmpeg_executable
+from pipelines.tools.ffmpeg import compile_command
 
 _WAITING_FRAMES = 8
 _CLOSE_TIMEOUT_S = 300.0
@@ -38,26 +38,21 @@ class VideoWriter:
             raise ValueError(f"yuv420p needs even sides, not {width}x{height}")
         self._path = path
         self._shape = (height, width, 3)
-        self._command: list[str] = (
-            ffmpeg.input(
-                "pipe:", format="rawvideo", pix_fmt="rgb24", s=f"{width}x{height}", framerate=fps
-            )
-            .output(
-                str(path),
-                vcodec="libx264",
-                pix_fmt="yuv420p",
-                crf=crf,
-                preset="medium",
-                vf="scale=out_color_matrix=bt709:out_range=tv",
-                colorspace="bt709",
-                color_primaries="bt709",
-                color_trc="bt709",
-                movflags="+faststart",
-            )
-            .global_args("-loglevel", "warning", "-nostdin")
-            .overwrite_output()
-            .compile(cmd=str(ffmpeg_executable()))
+        stream = ffmpeg.input(
+            "pipe:", format="rawvideo", pix_fmt="rgb24", s=f"{width}x{height}", framerate=fps
+        ).output(
+            str(path),
+            vcodec="libx264",
+            pix_fmt="yuv420p",
+            crf=crf,
+            preset="medium",
+            vf="scale=out_color_matrix=bt709:out_range=tv",
+            colorspace="bt709",
+            color_primaries="bt709",
+            color_trc="bt709",
+            movflags="+faststart",
         )
+        self._command = compile_command(stream, log_level="warning")
         self._frames: queue.Queue[bytes | None] = queue.Queue(maxsize=_WAITING_FRAMES)
         self._process: subprocess.Popen[bytes] | None = None
         self._log: list[str] = []

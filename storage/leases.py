@@ -130,13 +130,18 @@ def heartbeat(
     return HeartbeatReply(cancel_requested=state != "running", lost=False)
 
 
-def _held(session: Session, claim: Claim) -> tuple[Job, list[StageRow], StageRow]:
-    """The job, locked, and the claimed stage. Raises LostLeaseError where the claim is void."""
+def _locked(session: Session, claim: Claim) -> tuple[Job, list[StageRow], StageRow]:
+    """The job, locked, and the stage. Raises LostLeaseError where the job was deleted."""
     try:
         job, stages = lock_job(session, claim.job_id)
     except NotFoundError as error:
         raise LostLeaseError(f"job {claim.job_id} was deleted") from error
-    row = next(row for row in stages if row.id == claim.stage_id)
+    return job, stages, next(row for row in stages if row.id == claim.stage_id)
+
+
+def _held(session: Session, claim: Claim) -> tuple[Job, list[StageRow], StageRow]:
+    """The same, where the claim still holds; raises LostLeaseError where it is void."""
+    job, stages, row = _locked(session, claim)
     if row.state != "running" or row.lease_token != claim.token:
         raise LostLeaseError(f"stage {claim.stage_id} is {row.state} under token {row.lease_token}")
     return job, stages, row
@@ -154,8 +159,7 @@ def succeed_stage(
 
     Safe to repeat after a commit whose outcome is unknown: the second call changes nothing.
     """
-    job, stages = lock_job(session, claim.job_id)
-    row = next(row for row in stages if row.id == claim.stage_id)
+    _, stages, row = _locked(session, claim)
     if row.state == "succeeded" and row.lease_token == claim.token:
         return [other.id for other in stages if other.state == "ready"]
     job, stages, row = _held(session, claim)

@@ -11,7 +11,16 @@ import time
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import BigInteger, Boolean, ForeignKey, Index, Integer, MetaData, String, Text
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Text,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
 from storage.db import CleanJson, CleanText, UtcDateTime
@@ -92,7 +101,7 @@ class StageRow(Base):
     __tablename__ = "stages"
 
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), index=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     name: Mapped[str] = mapped_column(String(32))
     seq: Mapped[int] = mapped_column(Integer)
     after: Mapped[list[str]] = mapped_column(CleanJson)

@@ -7,7 +7,7 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 from urllib.parse import quote
 
 import boto3
@@ -19,9 +19,6 @@ from botocore.exceptions import BotoCoreError, ClientError
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
 from storage.objects import CHUNK_BYTES, ObjectStat, OnBytes, check_key, check_prefix
 from storage.settings import StorageSettings
-
-if TYPE_CHECKING:
-    from mypy_boto3_s3 import S3Client
 
 _TRANSFER = TransferConfig(
     multipart_threshold=16 << 20, multipart_chunksize=16 << 20, max_concurrency=4
@@ -148,7 +145,7 @@ class S3ObjectStore:
     def signed_url(self, key: str, *, expires_s: int, filename: str, media_type: str) -> str:
         """A presigned GET of one object."""
         with _translated(key):
-            return self._signer.generate_presigned_url(
+            url: str = self._signer.generate_presigned_url(
                 "get_object",
                 Params={
                     "Bucket": self._bucket,
@@ -158,6 +155,7 @@ class S3ObjectStore:
                 },
                 ExpiresIn=expires_s,
             )
+        return url
 
     def ping(self) -> None:
         """Raise ObjectStoreError where the bucket does not answer."""
@@ -168,8 +166,7 @@ class S3ObjectStore:
                 raise ObjectStoreError(f"Bucket {self._bucket} cannot be used.") from error
 
 
-def _make_client(settings: StorageSettings, endpoint: str) -> S3Client:
-    style = "path" if settings.s3_path_style else "auto"
+def _make_client(settings: StorageSettings, endpoint: str) -> Any:
     return boto3.client(
         "s3",
         endpoint_url=endpoint or None,
@@ -178,7 +175,7 @@ def _make_client(settings: StorageSettings, endpoint: str) -> S3Client:
         aws_secret_access_key=settings.s3_secret_access_key.get_secret_value() or None,
         config=Config(
             signature_version="s3v4",
-            s3={"addressing_style": style},
+            s3={"addressing_style": "path" if settings.s3_path_style else "auto"},
             connect_timeout=5,
             read_timeout=60,
             max_pool_connections=20,

@@ -76,7 +76,7 @@ def decode_cursor(cursor: str) -> tuple[datetime, str]:
 
 def _page(
     session: Session,
-    query: Select[tuple[Record]],
+    query: Select[Record],
     model: type[Record],
     limit: int,
     cursor: str | None,

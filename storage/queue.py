@@ -69,9 +69,8 @@ class Bell:
                 update(StageRow).where(StageRow.id.in_(ids)).values(rung_at=now(session))
             )
             gpu = has_live_gpu(session)
-        return all(
-            [self._send(TASK_RUN_STAGE, [row.id], queue_for(row.needs_gpu, gpu)) for row in rows]
-        )
+        sent = [self._send(TASK_RUN_STAGE, [row.id], queue_for(row.needs_gpu, gpu)) for row in rows]
+        return all(sent)
 
     def ring_sweep(self) -> bool:
         """Ask any worker for a round of housekeeping now. Whether the message went."""

@@ -149,7 +149,7 @@ def append_logs(
 def read_logs(
     session: Session, job_id: str, *, stage: str | None = None, line: int = 0, limit: int = 1000
 ) -> LogPage:
-    """Lines from number `line` on, of all stages or of one; a negative `line` counts from the end."""
+    """Lines from number `line` on, of one stage or all; a negative `line` counts from the end."""
     conditions = [LogLine.job_id == job_id]
     if stage is not None:
         conditions.append(LogLine.stage == stage)

@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-SECRET_FILE = "secret.key"
+KEY_FILE = "signing.key"
 
 
 class StorageSettings(BaseSettings):
@@ -65,7 +65,7 @@ class StorageSettings(BaseSettings):
         given = self.secret_key.get_secret_value()
         if given:
             return given.encode()
-        path = self.home / SECRET_FILE
+        path = self.home / KEY_FILE
         self.home.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
         try:

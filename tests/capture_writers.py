@@ -100,7 +100,9 @@ def quaternion(rotation: Floats) -> list[float]:
     return [float(value) for value in found]
 
 
-def write_polycam(path: Path, num: int = 24, width: int = 640, corrected: bool = True) -> CamerasFile:
+def write_polycam(
+    path: Path, num: int = 24, width: int = 640, corrected: bool = True
+) -> CamerasFile:
     """A Polycam raw export: `keyframes/` with pictures, camera files, depth and confidence.
 
     Names are microseconds. With `corrected`, `corrected_cameras/` holds the true poses and
@@ -216,9 +218,7 @@ def write_nerfstudio(
     """
     camera = phone_camera(long_side_px)
     truth = walk(num, camera)
-    names = {
-        index: f"{folder}images/frame_{index + 1:05d}.jpg" for index in range(num)
-    }
+    names = {index: f"{folder}images/frame_{index + 1:05d}.jpg" for index in range(num)}
     frames = [
         {
             "file_path": names[index].removeprefix(folder),
@@ -281,7 +281,7 @@ def write_hdr_hevc(
         f"setparams=range=tv:{tags}",
         "c:v": "libx265",
         "preset": "ultrafast",
-        "crf": 20,
+        "crf": 14,
         "tag:v": "hvc1",
         "x265-params": f"log-level=error:colorprim=bt2020:transfer={curve}:colormatrix=bt2020nc",
     }

@@ -8,6 +8,7 @@ process left can be told from what is still coming in, and is removed at the nex
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import fcntl
 import hashlib
 import secrets
@@ -22,6 +23,9 @@ from python_multipart import MultipartParser
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import parse_options_header
 
+from starlette.requests import ClientDisconnect
+from starlette.types import Receive
+
 from api.problems import (
     ApiError,
     InvalidRequestError,
@@ -35,6 +39,7 @@ CHECK_DISK_BYTES = 64 << 20
 MAX_PARTS = 16
 MAX_OTHER_BYTES = 64 << 10
 FRAMING_BYTES = 1 << 20
+IDLE_S = 120.0
 LINGER_BYTES = 32 << 20
 LINGER_S = 5.0
 SUFFIX = ".upload"
@@ -213,8 +218,49 @@ def _malformed(error: FormParserError) -> ApiError:
     )
 
 
+class Body:
+    """A request's body as it comes in."""
+
+    def __init__(self, receive: Receive) -> None:
+        self._receive = receive
+        self._ended = False
+
+    async def chunks(self) -> AsyncIterator[bytes]:
+        """The bytes. Raises ClientDisconnect, and ApiError where nothing comes for IDLE_S."""
+        while not self._ended:
+            try:
+                async with asyncio.timeout(IDLE_S):
+                    message = await self._receive()
+            except TimeoutError as error:
+                raise ApiError(
+                    f"Nothing came for {IDLE_S:.0f} s.",
+                    code="upload_stalled",
+                    hint="Send it again over a better connection; nothing of it was kept.",
+                    status=408,
+                ) from error
+            if message["type"] == "http.disconnect":
+                self._ended = True
+                raise ClientDisconnect
+            self._ended = not message.get("more_body", False)
+            yield message.get("body", b"")
+
+    async def linger(self) -> None:
+        """Read on for a little while after a refusal.
+
+        A connection that is closed on a client which still sends is reset, and the client may lose
+        the answer; so what is already under way is taken in and dropped, within bounds.
+        """
+        dropped = 0
+        with contextlib.suppress(TimeoutError, ClientDisconnect, ApiError):
+            async with asyncio.timeout(LINGER_S):
+                async for chunk in self.chunks():
+                    dropped += len(chunk)
+                    if dropped > LINGER_BYTES:
+                        return
+
+
 async def receive(
-    stream: AsyncIterator[bytes],
+    body: Body,
     content_type: str | None,
     content_length: str | None,
     staging: tuple[Path, BinaryIO],
@@ -222,8 +268,7 @@ async def receive(
 ) -> Received:
     """Read an upload to its end into the staging file.
 
-    Raises ApiError for what the service does not take; whatever the stream raises when the client
-    goes away passes through. The caller removes the file (`staging_file` does).
+    Raises ApiError for what the service does not take, ClientDisconnect where the client goes away. The caller removes the file (`staging_file` does).
     """
     path, file = staging
     part = _FilePart(limits)
@@ -239,7 +284,7 @@ async def receive(
         while view:
             view = view[file.write(view) :]
 
-    async for chunk in stream:
+    async for chunk in body.chunks():
         try:
             parser.write(chunk)
         except FormParserError as error:
@@ -263,20 +308,3 @@ async def receive(
         )
     await asyncio.to_thread(write_pending)
     return Received(path, part.filename, part.size, digest.hexdigest())
-
-
-async def linger(stream: AsyncIterator[bytes]) -> None:
-    """Read on for a little while after a refusal.
-
-    A connection that is closed on a client which still sends is reset, and the client may lose
-    the answer; so what is already under way is taken in and dropped, within bounds.
-    """
-    dropped = 0
-    try:
-        async with asyncio.timeout(LINGER_S):
-            async for chunk in stream:
-                dropped += len(chunk)
-                if dropped > LINGER_BYTES:
-                    return
-    except TimeoutError:
-        return

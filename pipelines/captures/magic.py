@@ -18,7 +18,8 @@ def video_container(head: bytes) -> str | None:
     box = head[4:8]
     if box == b"ftyp":
         return None if head[8:12] in _HEIF_BRANDS | _RAW_BRANDS else "mov"
-    if box in _QUICKTIME_BOXES:
+    # Text may hold those letters there too, but does not start with a box's size.
+    if box in _QUICKTIME_BOXES and head[0] < 0x20:
         return "mov"
     if head[:4] == b"\x1a\x45\xdf\xa3":
         return "matroska"

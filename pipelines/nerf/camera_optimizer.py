@@ -65,15 +65,14 @@ class CameraOptimizer(nn.Module):
         if self.mode == "off":
             return rays
         tangent = self.tangent[rays.camera_indices]
-        if self.mode == "se3":
-            rotation, shift = se3_exp(tangent)
-        else:
-            rotation, shift = so3_exp(tangent[:, 3:]), tangent[:, :3]
-        return replace(
-            rays,
-            origins=rays.origins + shift,
-            directions=(rotation @ rays.directions[..., None]).squeeze(-1),
-        )
+        # Products of half precision would turn every ray by a thousandth.
+        with torch.autocast(tangent.device.type, enabled=False):
+            if self.mode == "se3":
+                rotation, shift = se3_exp(tangent)
+            else:
+                rotation, shift = so3_exp(tangent[:, 3:]), tangent[:, :3]
+            directions = (rotation @ rays.directions[..., None]).squeeze(-1)
+        return replace(rays, origins=rays.origins + shift, directions=directions)
 
     def penalty(self) -> Tensor:
         """Weighted mean lengths of the translations and rotations; a scalar."""
@@ -81,7 +80,8 @@ class CameraOptimizer(nn.Module):
             return self.tangent.sum()
         moved = self.tangent[:, :3].norm(dim=-1).mean()
         turned = self.tangent[:, 3:].norm(dim=-1).mean()
-        return self.translation_penalty * moved + self.rotation_penalty * turned
+        penalty: Tensor = self.translation_penalty * moved + self.rotation_penalty * turned
+        return penalty
 
 
 def _skew(omega: Tensor) -> Tensor:

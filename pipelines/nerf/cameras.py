@@ -20,6 +20,8 @@ from pipelines.nerf.errors import NerfError
 from pipelines.nerf.lenses import distort, undistort
 from pipelines.nerf.rays import Rays
 
+MAX_SKEW = 1e-3
+"""Largest departure of R R^T from the identity that still counts as rounding."""
 CAMERA_MODELS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE")
 
 
@@ -59,11 +61,15 @@ class SceneTransform:
 
     def scene_from_world(self, points: ArrayLike) -> NDArray[np.float64]:
         """World points [..., 3] in scene units."""
-        return (np.asarray(points, dtype=np.float64) - np.asarray(self.center)) * self.scale
+        centered: NDArray[np.float64] = np.asarray(points, np.float64) - np.asarray(self.center)
+        centered *= self.scale
+        return centered
 
     def world_from_scene(self, points: ArrayLike) -> NDArray[np.float64]:
         """Scene points [..., 3] in world units."""
-        return np.asarray(points, dtype=np.float64) / self.scale + np.asarray(self.center)
+        centered: NDArray[np.float64] = np.asarray(points, np.float64) / self.scale
+        centered += np.asarray(self.center)
+        return centered
 
 
 @dataclass(frozen=True)
@@ -107,13 +113,10 @@ class Cameras:
         num = len(poses)
         _require(poses.shape == (num, 3, 4) and num > 0, "world_from_camera is not [N, 3, 4]")
         _require(bool(np.isfinite(poses).all()), "world_from_camera is not finite")
-        gram = poses[:, :, :3] @ poses[:, :, :3].transpose(0, 2, 1)
-        _require(
-            bool(
-                np.abs(gram - np.eye(3)).max() < 1e-3 and (np.linalg.det(poses[:, :, :3]) > 0).all()
-            ),
-            "world_from_camera holds something other than a rotation",
-        )
+        turns = poses[:, :, :3]
+        skewed = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max() > MAX_SKEW
+        mirrored = (np.linalg.det(turns) <= 0.0).any()
+        _require(not (skewed or mirrored), "world_from_camera holds more than a rotation")
         poses[:, :, 3] = scene.scene_from_world(poses[:, :, 3])
         names = ["PINHOLE"] * num if models is None else list(models)
         _require(len(names) == num, "models has another length than world_from_camera")

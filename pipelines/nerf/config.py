@@ -18,8 +18,6 @@ from pipelines.nerf.errors import NerfError
 
 def option(default: Any, help: str, **bounds: Any) -> Any:
     """A dataclass field with its meaning; `bounds`: unit, ge, le, choices."""
-    if isinstance(default, type):
-        return field(default_factory=default, metadata={"help": help, **bounds})
     return field(default=default, metadata={"help": help, **bounds})
 
 
@@ -70,7 +68,9 @@ class NerfactoConfig:
         default_factory=_default_proposals, metadata={"help": "The proposal networks."}
     )
     share_proposal_network: bool = option(False, "Use the first network in every round.")
-    grid: HashGridConfig = option(HashGridConfig, "The field's hash grid.")
+    grid: HashGridConfig = field(
+        default_factory=HashGridConfig, metadata={"help": "The field's hash grid."}
+    )
     hidden_dim: int = option(64, "Width of the density MLP.", ge=1, le=1024)
     hidden_dim_color: int = option(64, "Width of the colour MLP.", ge=1, le=1024)
     geo_feature_dim: int = option(15, "Features from density to colour.", ge=1, le=256)
@@ -148,9 +148,13 @@ class TrainConfig:
         "`fast` uses compiled kernels, `plain` the PyTorch definitions.",
         choices=("auto", "plain", "fast"),
     )
-    model: NerfactoConfig = option(NerfactoConfig, "The model's options.")
-    data: DataConfig = option(DataConfig, "The data's options.")
-    optimizer: OptimizerConfig = option(OptimizerConfig, "The optimiser's options.")
+    model: NerfactoConfig = field(
+        default_factory=NerfactoConfig, metadata={"help": "The model's options."}
+    )
+    data: DataConfig = field(default_factory=DataConfig, metadata={"help": "The data's options."})
+    optimizer: OptimizerConfig = field(
+        default_factory=OptimizerConfig, metadata={"help": "The optimiser's options."}
+    )
 
 
 def validate(config: TrainConfig) -> None:

@@ -96,10 +96,10 @@ class ImageData:
             valid = torch.ones(len(pixels), dtype=torch.bool)
         for index, image in enumerate(images):
             rows = slice(int(offsets[index]), int(offsets[index + 1]))
-            pixels[rows] = torch.from_numpy(np.ascontiguousarray(image)).reshape(-1, 3)
+            pixels[rows] = torch.tensor(image).reshape(-1, 3)
             mask = masks[index] if masks is not None else None
             if valid is not None and mask is not None:
-                valid[rows] = torch.from_numpy(np.ascontiguousarray(mask)).reshape(-1)
+                valid[rows] = torch.tensor(mask).reshape(-1)
         return cls(pixels=pixels, sizes=sizes, offsets=offsets, valid=valid)
 
 
@@ -160,7 +160,8 @@ def _load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
             raise _undecodable(path) from error
     picture = Image.fromarray(allowed.astype(np.uint8) * 255).resize(size, Image.Resampling.BOX)
     # A reduced pixel counts only where all of it is allowed.
-    return np.asarray(picture, dtype=np.uint8) == 255
+    usable: NDArray[np.bool_] = np.asarray(picture, dtype=np.uint8) == 255
+    return usable
 
 
 class PixelSampler:

@@ -7,6 +7,7 @@ README.md; `kernels/` reads it. Wiring is left to `models`.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -35,7 +36,8 @@ class _TruncatedExp(torch.autograd.Function):
 
 def truncated_exp(logits: Tensor) -> Tensor:
     """exp(x), with exp(clamp(x, -15, 15)) as its derivative. In float32, any shape."""
-    result: Tensor = _TruncatedExp.apply(logits.float() if logits.dtype.itemsize < 4 else logits)  # type: ignore[no-untyped-call]
+    precise = logits if logits.dtype == torch.float64 else logits.float()
+    result: Tensor = _TruncatedExp.apply(precise)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -47,7 +49,7 @@ class MLP(nn.Module):
 
     def __init__(self, *widths: int) -> None:
         super().__init__()
-        pairs = zip(widths[:-1], widths[1:], strict=True)
+        pairs = pairwise(widths)
         self.layers = nn.ModuleList(nn.Linear(inputs, outputs) for inputs, outputs in pairs)
 
     def forward(self, values: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ def ssim(predicted: Tensor, truth: Tensor) -> float:
     stack = torch.cat([x, y, x * x, y * y, x * y])[:, None]  # [15, 1, H, W]
     blurred = torch.nn.functional.conv2d(stack, window[None, None, :, None])
     blurred = torch.nn.functional.conv2d(blurred, window[None, None, None, :])[:, 0]
-    mean_x, mean_y, square_x, square_y, product = blurred.split(3)
+    mean_x, mean_y, square_x, square_y, product = torch.split(blurred, 3)
     variance_x = (square_x - mean_x.square()).clamp_min(0.0)
     variance_y = (square_y - mean_y.square()).clamp_min(0.0)
     covariance = product - mean_x * mean_y

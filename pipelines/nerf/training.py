@@ -36,25 +36,19 @@ PREVIEWS_PER_RUN = 10
 class TrainProgress:
     """How far training is, after `step` of `max_steps` steps.
 
+    fraction: share of the run that is done, [0, 1]; by time where `max_seconds` ends it earlier.
     losses: weighted terms of the last step by name. psnr: of its batch, dB. elapsed_s: training
     time of all attempts. eta_s: time left at the pace of the last steps, or None before any.
     """
 
     step: int
     max_steps: int
+    fraction: float
     losses: dict[str, float]
     psnr: float
     elapsed_s: float
     eta_s: float | None
     rays_per_s: float
-
-    @property
-    def fraction(self) -> float:
-        """Share of the run that is done, [0, 1]; by time where `max_seconds` ends it."""
-        by_steps = self.step / self.max_steps
-        if self.eta_s is None or self.elapsed_s <= 0.0:
-            return by_steps
-        return max(by_steps, self.elapsed_s / (self.elapsed_s + self.eta_s))
 
 
 def learning_rate(step: int, initial: float, final: float, decay_steps: int) -> float:
@@ -141,21 +135,13 @@ def train(
     validate(config)
     _check_sizes(images, cameras, train_indices)
     device = choose_device(config.device)
-    on_gpu = device.type == "cuda"
     fingerprint = _fingerprint(config, seed, len(train_indices))
     state = _initial_state(config, len(train_indices), seed, device)
     if checkpoint_path is not None and checkpoint_path.exists():
-        saved = load_checkpoint(checkpoint_path)
-        if saved["fingerprint"] != fingerprint:
-            raise NerfError(
-                "bad_checkpoint",
-                "The checkpoint belongs to a run with other options, images or seed.",
-                "Remove it to train from the start.",
-            )
-        state.restore(saved)
+        _resume(state, checkpoint_path, fingerprint)
     sampler = PixelSampler(images, train_indices)
     posed = cameras.select(train_indices).to(device)
-    model, parameters = state.model, list(state.model.parameters())
+    model = state.model.train()
     preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
     step_times: deque[float] = deque(maxlen=TIMED_STEPS)
     last_saved = time.monotonic()
@@ -165,46 +151,69 @@ def train(
             save_checkpoint(checkpoint_path, {"fingerprint": fingerprint, **state.as_dict()})
             on_checkpoint()
 
-    model.train()
     while state.step < config.max_steps and not _time_is_up(state.elapsed_s, config):
         started = time.monotonic()
-        step = state.step
-        _set_learning_rates(state.optimizers, config.optimizer, step)
-        state.steps_since_update += 1
-        update = proposals_due(step, state.steps_since_update, config.model)
-
-        index, pixels, colors = sampler.draw(config.rays_per_step, state.pixel_random)
-        index, pixels, colors = index.to(device), pixels.to(device), colors.to(device)
-        with torch.autocast(device.type, dtype=torch.float16, enabled=on_gpu):
-            rays = posed.generate_rays(index, pixels)
-            outputs = model(rays, step=step, update_proposals=update, generator=state.model_random)
-            losses = model.loss_dict(outputs, colors, update_proposals=update)
-        is_reported = not on_gpu or step % STEPS_PER_CUDA_REPORT == 0
-        if is_reported:  # reading a value waits for the GPU
-            values = _checked_values(losses, step)
-        for parameter in parameters:
-            parameter.grad = None  # a parameter without gradient is left alone by Adam
-        state.scaler.scale(torch.stack(list(losses.values())).sum()).backward()
-        for optimizer in state.optimizers.values():
-            state.scaler.step(optimizer)
-        state.scaler.update()
-
-        state.step += 1
-        state.steps_since_update = 0 if update else state.steps_since_update
+        is_reported = device.type == "cpu" or state.step % STEPS_PER_CUDA_REPORT == 0
+        losses = _optimise_once(state, sampler, posed, config, check=is_reported)
         step_times.append(time.monotonic() - started)
         state.elapsed_s += step_times[-1]
         if is_reported:
-            on_progress(_progress(state, config, values, step_times))
+            on_progress(_progress(state, config, losses, step_times))
         if time.monotonic() - last_saved >= config.checkpoint_seconds:
             save()
             last_saved = time.monotonic()
         if state.step % preview_every == 0:
-            model.eval()
             with torch.no_grad():
-                on_preview(state.step, model)
+                on_preview(state.step, model.eval())
             model.train()
     save()
     return model.eval()
+
+
+def _optimise_once(
+    state: _State, sampler: PixelSampler, cameras: Cameras, config: TrainConfig, *, check: bool
+) -> dict[str, float]:
+    """One step: pixels -> rays -> model -> losses -> Adam.
+
+    check: read the losses, which waits for the GPU. Returns them by name, or {} unread.
+    """
+    model, step = state.model, state.step
+    device = cameras.focal.device
+    _set_learning_rates(state.optimizers, config.optimizer, step)
+    state.steps_since_update += 1
+    update = proposals_due(step, state.steps_since_update, config.model)
+
+    drawn = sampler.draw(config.rays_per_step, state.pixel_random)
+    index, pixels, colors = (item.to(device) for item in drawn)
+    rays = cameras.generate_rays(index, pixels)
+    with torch.autocast(device.type, dtype=torch.float16, enabled=device.type == "cuda"):
+        outputs = model(rays, step=step, update_proposals=update, generator=state.model_random)
+        losses = model.loss_dict(outputs, colors, update_proposals=update)
+    values = _checked_values(losses, step) if check else {}
+
+    for parameter in model.parameters():
+        parameter.grad = None  # Adam leaves alone what has no gradient: proposals between updates
+    total = torch.stack(list(losses.values())).sum()
+    torch.autograd.backward(state.scaler.scale(total))
+    for optimizer in state.optimizers.values():
+        state.scaler.step(optimizer)
+    state.scaler.update()
+
+    state.step += 1
+    if update:
+        state.steps_since_update = 0
+    return values
+
+
+def _resume(state: _State, path: Path, fingerprint: str) -> None:
+    saved = load_checkpoint(path)
+    if saved["fingerprint"] != fingerprint:
+        raise NerfError(
+            "bad_checkpoint",
+            "The checkpoint belongs to a run with other options, images or seed.",
+            "Remove it to train from the start.",
+        )
+    state.restore(saved)
 
 
 def _initial_state(config: TrainConfig, num_images: int, seed: int, device: torch.device) -> _State:
@@ -265,11 +274,14 @@ def _progress(
 ) -> TrainProgress:
     per_step = sum(step_times) / len(step_times)
     eta_s = (config.max_steps - state.step) * per_step
+    fraction = state.step / config.max_steps
     if config.max_seconds > 0.0:
         eta_s = min(eta_s, max(0.0, config.max_seconds - state.elapsed_s))
+        fraction = max(fraction, min(1.0, state.elapsed_s / config.max_seconds))
     return TrainProgress(
         step=state.step,
         max_steps=config.max_steps,
+        fraction=fraction,
         losses=losses,
         psnr=psnr_from_mse(losses["rgb"]),
         elapsed_s=state.elapsed_s,

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pipelines.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.errors import ToolError
 from pipelines.sample.scene import SCENE_SIZE_M, Floats, pose_matrix, render
-from imageio_ffmpeg import get_ffmpeg_exe as ffmpeg_executable
+from pipelines.tools.ffmpeg import ffmpeg_executable
 
 FRAME_RATE = 30.0
 NUM_FRAMES = 120
@@ -80,9 +80,7 @@ def hand_held_pose(progress: float) -> Floats:
     eye = np.array([radius * math.cos(azimuth), radius * math.sin(azimuth), height])
     time = progress * 4.0  # seconds of a walk at its usual pace
     eye += 0.012 * np.array([_sway(time, s, 0.9, 0.53, 0.37) for s in (1.0, 2.0, 3.0)])
-    target = _TARGET + np.array(
-        [0.06 * _sway(time, s, 1.7, 0.83, 0.41) for s in (4.0, 5.0, 6.0)]
-    )
+    target = _TARGET + np.array([0.06 * _sway(time, s, 1.7, 0.83, 0.41) for s in (4.0, 5.0, 6.0)])
     roll = math.radians(2.5 * _sway(time, 7.0, 1.9, 0.71))
     forward = target - eye
     forward /= np.linalg.norm(forward)
@@ -159,7 +157,7 @@ def film_capture(
     i of the file is image i. Raises ToolError where ffmpeg fails.
     """
     truth = walk(num_frames, phone_camera(long_side_px))
-    options = {
+    options: dict[str, str | int] = {
         "c:v": "libx264",
         "preset": "veryfast",
         "crf": 18,

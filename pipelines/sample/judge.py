@@ -7,6 +7,7 @@ that same similarity and nothing else, so a wrong scale or a tilt shows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,12 +150,10 @@ def _distance_to_mesh(points: Floats, vertices: Floats, faces: NDArray[np.intege
     """Exact distance of points [N, 3] to the nearest triangle, [N]."""
     import open3d  # takes a second to import, and only meshes need it
 
+    def tensor(values: Any, kind: Any) -> Any:
+        return open3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=kind))
+
     scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        open3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
-        open3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
-    )
-    distances = scene.compute_distance(
-        open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
-    )
+    scene.add_triangles(tensor(vertices, np.float32), tensor(faces, np.uint32))
+    distances = scene.compute_distance(tensor(points, np.float32))
     return np.asarray(distances.numpy(), dtype=np.float64)

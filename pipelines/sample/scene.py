@@ -41,6 +41,9 @@ class Region:
 SUBJECT = Region((-1.1, -1.1, -0.1), (1.1, 1.1, 1.1))
 """The things that the cameras circle around, and the floor below them."""
 
+THINGS = Region((-1.1, -1.1, 0.04), (1.1, 1.1, 1.1))
+"""The same without the floor, which fits onto itself under many wrong moves."""
+
 ROOM = Region((-5.0, -4.5, 0.0), (5.0, 4.5, 3.4))
 """All that there is."""
 
@@ -228,7 +231,8 @@ def seen_surface(truth: CamerasFile, region: Region = SUBJECT, num_points: int =
         parts.append(points[region.contains(points)])
     points = np.concatenate(parts) if parts else np.empty((0, 3))
     keep = np.unique(np.linspace(0, len(points) - 1, min(num_points, len(points))).astype(int))
-    return points[keep]
+    thinned: Floats = points[keep]
+    return thinned
 
 
 def surface_distance(points: Floats) -> Floats:
@@ -249,7 +253,7 @@ def _distance_to(thing: Primitive, points: Floats) -> Floats:
     local = (points - thing.center) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     size = np.array(thing.size)
     if thing.kind == tracing.SPHERE:
-        return np.abs(np.linalg.norm(local, axis=1) - size[0])
+        return np.asarray(np.abs(np.linalg.norm(local, axis=1) - size[0]))
     if thing.kind in (tracing.BOX, tracing.ROOM):
         return _box_distance(np.abs(local), size)
     rho, z = np.hypot(local[:, 0], local[:, 1]), local[:, 2]

@@ -225,7 +225,7 @@ def _misses_bound(p: Any, d: Any, row: Any) -> bool:
     along = x * d[0] + y * d[1] + z * d[2]
     r2 = row[COL_BOUND] * row[COL_BOUND]
     distance2 = x * x + y * y + z * z
-    return distance2 > r2 and (along < 0.0 or distance2 - along * along > r2)
+    return bool(distance2 > r2 and (along < 0.0 or distance2 - along * along > r2))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -266,9 +266,7 @@ def _trace(p: Any, d: Any, table: Any, out: Any, scratch: Any) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _shade(
-    p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scratch: Any
-) -> int:
+def _shade(p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scratch: Any) -> int:
     """Trace and paint: out[0:4] as `_trace`, out[4:7] = colour."""
     index = _trace(p, d, table, out, scratch)
     row = table[index]

@@ -178,22 +178,25 @@ class Reconstructor:
         options.num_threads = self.num_threads
         options.sift.max_num_features = num_features
         for group in groups:
-            reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = group.lens
-            names = [self.names[index] for index in group.indices]
-            self._run(
-                "finding features",
-                lambda token, reader=reader, names=names: pycolmap.extract_features(
-                    self.database,
-                    self.links,
-                    image_names=names,
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
-                    extraction_options=options,
-                    cancellation_token=token,
-                ),
-                lambda: watch(self._count(_COUNT_FEATURES)),
-            )
+            self._extract_group(group, options, watch)
+
+    def _extract_group(self, group: CameraGroup, options: Any, watch: Watch) -> None:
+        """Features of images that share one camera, which is made new."""
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = group.lens
+        self._run(
+            "finding features",
+            lambda token: pycolmap.extract_features(
+                self.database,
+                self.links,
+                image_names=[self.names[index] for index in group.indices],
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=options,
+                cancellation_token=token,
+            ),
+            lambda: watch(self._count(_COUNT_FEATURES)),
+        )
 
     def match(self, pairs: Iterable[tuple[int, int]], watch: Watch) -> None:
         """Match and verify pairs of indices; those already in the database are not done again.
@@ -346,9 +349,7 @@ def sparse_model(reconstruction: Any) -> SparseModel:
     cameras = [reconstruction.camera(camera_id) for camera_id in camera_ids]
     poses = np.stack([image.cam_from_world().inverse().matrix() for image in images])
     points = list(reconstruction.points3D.values())
-    center_of = {
-        image.image_id: pose[:, 3] for image, pose in zip(images, poses, strict=True)
-    }
+    center_of = {image.image_id: pose[:, 3] for image, pose in zip(images, poses, strict=True)}
     return SparseModel(
         indices=tuple(image_index(image.name) for image in images),
         cameras=tuple(

@@ -308,7 +308,7 @@ def _rate(stream: str) -> float | None:
 
 
 def _duration(text: str) -> float | None:
-    match = re.search(r"Duration: (\d+):(\d+):(\d+(?:\.\d+)?)", text)
+    match = re.search(r"^  Duration: (\d+):(\d+):(\d+(?:\.\d+)?)", text, re.MULTILINE)
     if match is None:
         return None
     hours, minutes, seconds = match.groups()

@@ -6,12 +6,15 @@ block (4 outputs x 16 samples) is written as LLVM vector code; it is portable, a
 AVX-512 or NEON for the machine at hand. Weights are packed in blocks of 4 outputs.
 """
 
+# Kernels carry no annotations: numba infers their types, docstrings state shapes.
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
 from torch import nn
@@ -48,8 +51,8 @@ def pack_layer(layer: nn.Linear, columns: slice = slice(None)) -> PackedLayer:
     return PackedLayer(np.ascontiguousarray(blocks), bias)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _block(typing_context, x, weights, bias, num_inputs, out, row_bytes, relu, accumulate):  # type: ignore[no-untyped-def]
+@intrinsic
+def _block(typing_context, x, weights, bias, num_inputs, out, row_bytes, relu, accumulate):
     """4 outputs of 16 samples; all arguments are integers, addresses in bytes.
 
     x, out: first of the 16 samples in the first row; rows are row_bytes apart. With `accumulate`
@@ -126,7 +129,7 @@ def _generate_block(context: Any, builder: Any, signature: Any, arguments: Any) 
 
 
 @compiled
-def apply_layer(x, layer, count, relu, accumulate, out):  # type: ignore[no-untyped-def]
+def apply_layer(x, layer, count, relu, accumulate, out):
     """out = layer(x) for the first `count` samples.
 
     x: [I, TILE], out: [O, TILE], contiguous float32; O padded to a multiple of 4. Up to 15 columns
@@ -138,7 +141,7 @@ def apply_layer(x, layer, count, relu, accumulate, out):  # type: ignore[no-unty
     w_at, b_at = np.intp(layer.weights.ctypes.data), np.intp(layer.bias.ctypes.data)
     for first in range(0, count, LANES):
         for block in range(num_blocks):
-            _block(
+            _block(  # type: ignore[call-arg]  # numba passes the typing context
                 x_at + first * 4,
                 w_at + block * num_inputs * BLOCK * 4,
                 b_at + block * BLOCK * 4,

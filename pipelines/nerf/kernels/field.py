@@ -4,6 +4,9 @@ The first layer sees [16 spherical harmonics, geometry, appearance]. The first a
 the same for all samples of a ray, so their share of the first layer is computed once per ray.
 """
 
+# Kernels carry no annotations: numba infers their types, docstrings state shapes.
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -60,7 +63,7 @@ def pack_color(layers: nn.ModuleList, num_geometry: int, appearance: Tensor | No
 
 
 @compiled
-def direction_harmonics(direction, out, column):  # type: ignore[no-untyped-def]
+def direction_harmonics(direction, out, column):
     """out[:16, column] = spherical harmonics: twin of `encodings.spherical_harmonics`."""
     x, y, z = direction[0], direction[1], direction[2]
     xx, yy, zz = x * x, y * y, z * z
@@ -83,7 +86,7 @@ def direction_harmonics(direction, out, column):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def color_logits(net, geometry, count, first, second, out):  # type: ignore[no-untyped-def]
+def color_logits(net, geometry, count, first, second, out):
     """out[:3, :count] = colours before the sigmoid.
 
     geometry: [geo, TILE]. first: [hidden, TILE], holding the rays' share of the first layer; it and

@@ -5,6 +5,9 @@ the plain definition, so values agree to float32 rounding. Backward gives one le
 so that no two threads write the same entry and the result depends only on the number of threads.
 """
 
+# Kernels carry no annotations: numba infers their types, docstrings state shapes.
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 from typing import Any
@@ -21,7 +24,7 @@ TILE = 256
 
 
 @compiled
-def cell_of(coordinate, resolution):  # type: ignore[no-untyped-def]
+def cell_of(coordinate, resolution):
     """Cell and place inside it of one unit coordinate; the same guards as the plain twin."""
     position = min(max(coordinate, np.float32(0.0)), np.float32(1.0)) * np.float32(resolution)
     # The second guard is on integers, because a NaN passes the first one.
@@ -30,7 +33,7 @@ def cell_of(coordinate, resolution):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def corner_terms(x, y, z, resolution, is_dense):  # type: ignore[no-untyped-def]
+def corner_terms(x, y, z, resolution, is_dense):
     """Per axis, the low and high terms whose sum (dense) or xor (hashed) is the entry."""
     if is_dense:
         stride = resolution + 1
@@ -46,7 +49,7 @@ def corner_terms(x, y, z, resolution, is_dense):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def corner_entries(x, y, z, resolution, is_dense, first, last):  # type: ignore[no-untyped-def]
+def corner_entries(x, y, z, resolution, is_dense, first, last):
     """Rows of the table of the eight corners of a cell, x fastest."""
     x0, x1, y0, y1, z0, z1 = corner_terms(x, y, z, resolution, is_dense)
     if is_dense:
@@ -67,7 +70,7 @@ def corner_entries(x, y, z, resolution, is_dense, first, last):  # type: ignore[
 
 
 @compiled
-def corner_weights(fx, fy, fz):  # type: ignore[no-untyped-def]
+def corner_weights(fx, fy, fz):
     """Trilinear weights of the eight corners, x fastest."""
     one = np.float32(1.0)
     gx, gy, gz = one - fx, one - fy, one - fz
@@ -76,7 +79,7 @@ def corner_weights(fx, fy, fz):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def encode_points(points, count, table, resolutions, dense, offsets, out):  # type: ignore[no-untyped-def]
+def encode_points(points, count, table, resolutions, dense, offsets, out):
     """Features of points[:count] into out[:count, :L * F]."""
     num_features = table.shape[1]
     for level in range(len(resolutions)):
@@ -118,7 +121,7 @@ def encode_points(points, count, table, resolutions, dense, offsets, out):  # ty
 
 
 @compiled
-def _forward(thread, threads, points, table, resolutions, dense, offsets, out):  # type: ignore[no-untyped-def]
+def _forward(thread, threads, points, table, resolutions, dense, offsets, out):
     num_points = len(points)
     for tile in range(thread, (num_points + TILE - 1) // TILE, threads):
         begin = tile * TILE
@@ -127,9 +130,7 @@ def _forward(thread, threads, points, table, resolutions, dense, offsets, out): 
 
 
 @compiled
-def scatter_level(  # type: ignore[no-untyped-def]
-    points, table, resolution, is_dense, first, last, grad_out, column, grad_table
-):
+def scatter_level(points, table, resolution, is_dense, first, last, grad_out, column, grad_table):
     """Add the gradient of one level to its entries."""
     num_features = table.shape[1]
     for p in range(len(points)):
@@ -151,7 +152,7 @@ def scatter_level(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def differentiate_level(  # type: ignore[no-untyped-def]
+def differentiate_level(
     points, table, resolution, is_dense, first, last, grad_out, column, grad_points
 ):
     """Add to grad_points [P, 3] what flows back through the places inside the cells of a level."""
@@ -190,7 +191,7 @@ def differentiate_level(  # type: ignore[no-untyped-def]
 @compiled
 def _backward_table(
     thread, threads, points, table, resolutions, dense, offsets, grad_out, grad_table
-):  # type: ignore[no-untyped-def]
+):
     num_features = table.shape[1]
     num_levels = len(resolutions)
     # Levels are dealt in turn, because fine levels cost more than coarse ones.
@@ -211,7 +212,7 @@ def _backward_table(
 @compiled
 def _backward_points(
     thread, threads, points, table, resolutions, dense, offsets, grad_out, grad_points
-):  # type: ignore[no-untyped-def]
+):
     num_features = table.shape[1]
     num_points = len(points)
     for tile in range(thread, (num_points + TILE - 1) // TILE, threads):

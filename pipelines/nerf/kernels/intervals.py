@@ -4,6 +4,9 @@ Symbols: S intervals with S + 1 edges; `t` scene distance along a unit ray; `s` 
 Sums run in float64 and are rounded once per element, as torch does it on the CPU.
 """
 
+# Kernels carry no annotations: numba infers their types, docstrings state shapes.
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 import math
@@ -19,7 +22,7 @@ CONTRACTION_CODES = {"linf": LINF, "l2": L2, "none": NONE}
 
 
 @compiled
-def spread_edges(s_edges, count, s_near, s_far, t_edges):  # type: ignore[no-untyped-def]
+def spread_edges(s_edges, count, s_near, s_far, t_edges):
     """t_edges[:count + 1] of s_edges: twin of `intervals.t_from_s`."""
     for i in range(count + 1):
         x = s_near + s_edges[i] * (s_far - s_near)
@@ -27,7 +30,7 @@ def spread_edges(s_edges, count, s_near, s_far, t_edges):  # type: ignore[no-unt
 
 
 @compiled
-def find_weights(density, t_edges, count, weights):  # type: ignore[no-untyped-def]
+def find_weights(density, t_edges, count, weights):
     """Twin of `intervals.weights_from_density` for one ray; returns the sum of the weights."""
     passed, total = 0.0, 0.0
     for i in range(count):
@@ -41,7 +44,7 @@ def find_weights(density, t_edges, count, weights):  # type: ignore[no-untyped-d
 
 
 @compiled
-def resample(s_edges, weights, total, count, num_new, padding, new_edges):  # type: ignore[no-untyped-def]
+def resample(s_edges, weights, total, count, num_new, padding, new_edges):
     """new_edges[:num_new + 1]: twin of `intervals.sample_pdf` without jitter.
 
     The draws increase, so one walk along the histogram finds all of them.
@@ -64,7 +67,7 @@ def resample(s_edges, weights, total, count, num_new, padding, new_edges):  # ty
 
 
 @compiled
-def place(origin, direction, t, contraction, unit):  # type: ignore[no-untyped-def]
+def place(origin, direction, t, contraction, unit):
     """unit[:] = the unit point at distance t; returns whether density may be there.
 
     Twin of `contraction.unit_from_scene`.
@@ -86,7 +89,7 @@ def place(origin, direction, t, contraction, unit):  # type: ignore[no-untyped-d
 
 
 @compiled
-def depths(weights, t_edges, count):  # type: ignore[no-untyped-def]
+def depths(weights, t_edges, count):
     """(median, expected) depth: twin of `rendering.median_depth` and `expected_depth`."""
     reached, moment = 0.0, 0.0
     median = -1

@@ -4,6 +4,9 @@ Used for the proposal networks and for the density half of the field, whose outp
 rows. Forward only. Twin of `fields.DensityField` up to the logit.
 """
 
+# Kernels carry no annotations: numba infers their types, docstrings state shapes.
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 from typing import Any, NamedTuple
@@ -52,7 +55,7 @@ def pack_density(grid: HashGrid, layers: nn.ModuleList) -> DensityNet:
 
 
 @compiled
-def density_logits(net, points, count, features, hidden, out):  # type: ignore[no-untyped-def]
+def density_logits(net, points, count, features, hidden, out):
     """Row 0 of out[O, TILE] becomes the logits at points[:count], the other rows the features.
 
     points: [TILE, 3] in [0, 1]. features [L * F, TILE] and hidden [H, TILE] are scratch.

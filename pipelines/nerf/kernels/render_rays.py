@@ -13,6 +13,9 @@ Each colour channel then changes by at most early_stop + S * weight_threshold, s
 lie in [0, 1] and that much weight is given to other samples of the same ray.
 """
 
+# Kernels carry no annotations: numba infers their types, docstrings state shapes.
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 import math
@@ -90,7 +93,7 @@ class Scratch(NamedTuple):
 
 
 @compiled
-def _make_scratch(model):  # type: ignore[no-untyped-def]
+def _make_scratch(model):
     rows = max(model.color.output.bias.size, model.density.output.bias.size)
     features = len(model.density.resolutions) * model.density.table.shape[1]
     width = max(model.density.hidden.bias.size, model.color.hidden.bias.size)
@@ -102,6 +105,7 @@ def _make_scratch(model):  # type: ignore[no-untyped-def]
     num_samples = model.settings.num_samples
     most, last = num_samples.max(), num_samples[-1]
     geometry = model.color.from_geometry.weights.shape[1]
+    features = max(features, geometry)
     kind = np.float32
     return Scratch(
         np.zeros((TILE, 3), kind),
@@ -125,7 +129,7 @@ def _make_scratch(model):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_column(scratch, column, ray, sample, origins, directions, contraction):  # type: ignore[no-untyped-def]
+def _add_column(scratch, column, ray, sample, origins, directions, contraction):
     """Let a column of the tile stand for a sample of a ray."""
     edges = scratch.t_edges
     t = np.float32(0.5) * (edges[ray, sample] + edges[ray, sample + 1])
@@ -137,7 +141,7 @@ def _add_column(scratch, column, ray, sample, origins, directions, contraction):
 
 
 @compiled
-def _fill_density(net, settings, scratch, count):  # type: ignore[no-untyped-def]
+def _fill_density(net, settings, scratch, count):
     """Densities of the samples in the first `count` columns."""
     density_logits(net, scratch.points, count, scratch.features, scratch.hidden, scratch.outputs)
     for column in range(count):
@@ -148,7 +152,7 @@ def _fill_density(net, settings, scratch, count):  # type: ignore[no-untyped-def
 
 
 @compiled
-def _propose(net, settings, scratch, origins, directions, count, num_new):  # type: ignore[no-untyped-def]
+def _propose(net, settings, scratch, origins, directions, count, num_new):
     """One proposal round of a block of rays: s_edges and t_edges become those of the next round."""
     num_rays = len(origins)
     column = 0
@@ -169,7 +173,7 @@ def _propose(net, settings, scratch, origins, directions, count, num_new):  # ty
 
 
 @compiled
-def _find_density(model, scratch, origins, directions, count):  # type: ignore[no-untyped-def]
+def _find_density(model, scratch, origins, directions, count):
     """Density and geometry of the field, front to back, until each ray has met enough."""
     settings = model.settings
     num_geometry = scratch.geometry.shape[2]
@@ -200,7 +204,7 @@ def _find_density(model, scratch, origins, directions, count):  # type: ignore[n
 
 
 @compiled
-def _fill_colors(model, scratch, count, rgb, weights):  # type: ignore[no-untyped-def]
+def _fill_colors(model, scratch, count, rgb, weights):
     """Add the weighted colours of the first `count` columns to their rays."""
     width = model.color.from_geometry.bias.size
     for row in range(width):
@@ -219,7 +223,7 @@ def _fill_colors(model, scratch, count, rgb, weights):  # type: ignore[no-untype
 
 
 @compiled
-def _shade(model, scratch, directions, count, rgb, accumulation, median, expected):  # type: ignore[no-untyped-def]
+def _shade(model, scratch, directions, count, rgb, accumulation, median, expected):
     """Colour, accumulation and depth of a block whose densities are known."""
     settings = model.settings
     num_rays, num_geometry = len(directions), scratch.geometry.shape[2]
@@ -267,7 +271,7 @@ def _shade(model, scratch, directions, count, rgb, accumulation, median, expecte
 
 
 @compiled
-def _render_block(model, scratch, origins, directions, rgb, accumulation, median, expected):  # type: ignore[no-untyped-def]
+def _render_block(model, scratch, origins, directions, rgb, accumulation, median, expected):
     settings = model.settings
     num_samples = settings.num_samples
     first = num_samples[0]
@@ -292,9 +296,7 @@ def _render_block(model, scratch, origins, directions, rgb, accumulation, median
 
 
 @compiled
-def _render(  # type: ignore[no-untyped-def]
-    thread, threads, model, origins, directions, rgb, accumulation, median, expected
-):
+def _render(thread, threads, model, origins, directions, rgb, accumulation, median, expected):
     """This thread's share: every n-th block, since neighbouring blocks cost about the same."""
     num_rays = len(origins)
     scratch = _make_scratch(model)

@@ -19,12 +19,10 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import torch
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Everything but the promise that there are no NaN: a diverged training must show, not hide.
 FAST_MATH = {"contract", "reassoc", "nsz", "arcp", "afn"}
@@ -54,20 +52,19 @@ def _cache_folder() -> Path:
     raise OSError("no writable folder for compiled kernels: set NUMBA_CACHE_DIR to one")
 
 
-numba.config.CACHE_DIR = str(_cache_folder())
+numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
 
 
-def compiled(function: Function) -> Function:
+def compiled(function: Callable[..., Any]) -> Any:
     """A kernel, or a function for use inside kernels: cached, without the interpreter's lock."""
-    decorated: Function = numba.njit(
+    return numba.njit(
         cache=True, fastmath=FAST_MATH, nogil=True, error_model="numpy", boundscheck=False
     )(function)
-    return decorated
 
 
 def num_threads() -> int:
     """Threads of a launch: as torch has them, at most one per processor."""
-    return max(1, min(int(numba.config.NUMBA_NUM_THREADS), torch.get_num_threads()))
+    return max(1, min(os.cpu_count() or 1, torch.get_num_threads()))
 
 
 def run_threads(kernel: Callable[..., None], *arguments: Any) -> None:

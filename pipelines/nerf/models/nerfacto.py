@@ -28,9 +28,9 @@ ALWAYS_UPDATE_BEFORE = 10
 class Outputs(TypedDict):
     """What a batch of rays shows.
 
-    rgb: [R, 3] in [0, 1]. accumulation: [R] in [0, 1]. depth: [R], median; expected_depth: [R]; both
-    distances along the ray in scene units. weights: [R, S] of each proposal round, then of the
-    field; samples: likewise.
+    rgb: [R, 3] in [0, 1]. accumulation: [R] in [0, 1].
+    depth: [R], median; expected_depth: [R]; both distances along the ray in scene units.
+    weights: [R, S] of each proposal round, then of the field; samples: likewise.
     """
 
     rgb: Tensor

@@ -1,0 +1,94 @@
+"""Artifacts: the files that the registry names, where their stages published them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+from fastapi import Request
+
+from api.artifacts.schemas import ArtifactView
+from api.deps import Services
+from api.problems import MissingError
+from pipelines.registry import STAGES
+from pipelines.stage import Artifact
+from storage.models import Job
+from storage.objects import LocalObjectStore
+
+_LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+
+
+@dataclass(frozen=True)
+class Published:
+    """An artifact that is there. key: in the object store."""
+
+    artifact: Artifact
+    key: str
+    bytes: int
+    sha256: str
+
+
+def published(job: Job) -> Iterator[Published]:
+    """The artifacts of the job's succeeded stages. The job is loaded with its manifests."""
+    rows = {row.name: row for row in job.stages}
+    for stage in STAGES:
+        row = rows.get(stage.name)
+        if row is None or row.state != "succeeded" or not row.output_prefix or not row.manifest:
+            continue
+        files = row.manifest.get("files", {})
+        for artifact in stage.artifacts:
+            entry = files.get(artifact.path)
+            if entry is not None:
+                key = row.output_prefix + artifact.path
+                yield Published(artifact, key, entry["bytes"], entry["sha256"])
+
+
+def find(job: Job, name: str) -> Published:
+    """One artifact by name. Raises MissingError."""
+    for found in published(job):
+        if found.artifact.name == name:
+            return found
+    known = sorted(artifact.name for stage in STAGES for artifact in stage.artifacts)
+    hint = (
+        f"The job is {job.state}; wait until the stage that makes it has succeeded."
+        if name in known
+        else f"A finished job has {', '.join(known)}."
+    )
+    raise MissingError(
+        f"Job {job.id} has no such artifact.", code="artifact_not_found", hint=hint
+    )
+
+
+def signed_url(services: Services, found: Published, request: Request) -> str:
+    """A URL that anyone can download the artifact from, for a while.
+
+    A local store signs for `public_url`; where that is a loopback address, which only this machine
+    could use, the address that the client came by takes its place.
+    """
+    url = services.store.signed_url(
+        found.key,
+        expires_s=services.settings.url_expires_s,
+        filename=found.artifact.name,
+        media_type=found.artifact.media_type,
+    )
+    if isinstance(services.store, LocalObjectStore):
+        public = services.settings.public_url.rstrip("/")
+        if urlsplit(public).hostname in _LOOPBACK:
+            return str(request.base_url).rstrip("/") + url.removeprefix(public)
+    return url
+
+
+def list_of(services: Services, job: Job, request: Request) -> list[ArtifactView]:
+    """What a job, loaded with its manifests, offers for download."""
+    return [
+        ArtifactView(
+            name=found.artifact.name,
+            media_type=found.artifact.media_type,
+            bytes=found.bytes,
+            sha256=found.sha256,
+            url=signed_url(services, found, request),
+            opens_with=found.artifact.opens_with,
+        )
+        for found in published(job)
+    ]

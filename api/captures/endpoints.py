@@ -1,0 +1,95 @@
+"""`/v1/captures`."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from starlette.requests import ClientDisconnect
+
+from api.captures import service
+from api.captures.receiving import Body, Limits, receive, staging_file
+from api.captures.schemas import CapturePage, CaptureView
+from api.deps import ServicesDep
+from api.errors import responses
+from api.problems import ApiError
+from storage import queries, records
+
+PATH = "/v1/captures"
+CLIENT_WENT_AWAY = 499
+router = APIRouter(prefix=PATH, tags=["captures"])
+
+_UPLOAD_SCHEMA = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {"file": {"type": "string", "format": "binary"}},
+                }
+            }
+        },
+    }
+}
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses=responses(408, 413, 415, 507),
+    openapi_extra=_UPLOAD_SCHEMA,
+    response_model=CaptureView,
+)
+async def create_capture(
+    request: Request, response: Response, services: ServicesDep
+) -> CaptureView | Response:
+    """Upload a capture as multipart part `file`. What it is, the bytes decide."""
+    settings = services.settings
+    limits = Limits(settings.max_upload_bytes, settings.min_free_bytes)
+    body = Body(request.receive)
+    headers = request.headers
+    with staging_file(settings.staging_dir) as staging:
+        try:
+            received = await receive(
+                body,
+                headers.get("content-type"),
+                headers.get("content-length"),
+                staging,
+                limits,
+            )
+        except ClientDisconnect:
+            return Response(status_code=CLIENT_WENT_AWAY)
+        except ApiError:
+            await body.linger()
+            raise
+        capture = await asyncio.to_thread(service.keep, services, received)
+    response.headers["Location"] = f"{PATH}/{capture.id}"
+    return CaptureView.of(capture)
+
+
+@router.get("", responses=responses())
+def list_captures(
+    services: ServicesDep,
+    limit: Annotated[int, Query(ge=1, le=100)] = 50,
+    cursor: Annotated[str | None, Query(max_length=500)] = None,
+) -> CapturePage:
+    """Captures, newest first."""
+    with services.database.read_scope() as session:
+        found, following = queries.list_captures(session, limit=limit, cursor=cursor)
+        return CapturePage(items=[CaptureView.of(one) for one in found], next_cursor=following)
+
+
+@router.get("/{capture_id}", responses=responses(404))
+def get_capture(capture_id: str, services: ServicesDep) -> CaptureView:
+    """One capture."""
+    with services.database.read_scope() as session:
+        return CaptureView.of(records.get_capture(session, capture_id))
+
+
+@router.delete("/{capture_id}", status_code=204, responses=responses(404, 409))
+def delete_capture(capture_id: str, services: ServicesDep) -> None:
+    """Delete a capture and its bytes. Finished jobs keep their results."""
+    service.delete(services, capture_id)

@@ -1,0 +1,116 @@
+"""`/v1/jobs`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
+
+from api.deps import ServicesDep
+from api.errors import responses
+from api.jobs import service
+from api.jobs.schemas import (
+    JobPage,
+    JobRequest,
+    JobState,
+    JobSummary,
+    JobView,
+    LogView,
+    StageName,
+)
+from storage import queries, records
+from storage.states import JOB_TERMINAL
+
+POLL_S = "1"
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+
+def _hint_poll(response: Response, job: JobView) -> None:
+    response.headers["Cache-Control"] = "no-store"
+    if job.state not in JOB_TERMINAL:
+        response.headers["Retry-After"] = POLL_S
+
+
+@router.post("", status_code=202, responses=responses(404))
+def create_job(
+    wanted: JobRequest,
+    services: ServicesDep,
+    background: BackgroundTasks,
+    request: Request,
+    response: Response,
+) -> JobView:
+    """Make a capture into assets. The answer's `Location` is the job's address."""
+    job_id = service.create(services, wanted, background)
+    with services.database.read_scope() as session:
+        job = service.view(services, session, job_id, request)
+    response.headers["Location"] = f"/v1/jobs/{job_id}"
+    _hint_poll(response, job)
+    return job
+
+
+@router.get("", responses=responses())
+def list_jobs(
+    services: ServicesDep,
+    state: Annotated[JobState | None, Query()] = None,
+    label: Annotated[
+        str | None, Query(max_length=400, description="KEY (has it) or KEY=VALUE.")
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=100)] = 50,
+    cursor: Annotated[str | None, Query(max_length=500)] = None,
+) -> JobPage:
+    """Jobs, newest first."""
+    with services.database.read_scope() as session:
+        found, following = queries.list_jobs(
+            session, state=state, label=label, limit=limit, cursor=cursor
+        )
+        return JobPage(items=[JobSummary.of(job) for job in found], next_cursor=following)
+
+
+@router.get("/{job_id}", responses=responses(404))
+def get_job(
+    job_id: str, services: ServicesDep, request: Request, response: Response
+) -> JobView:
+    """One job: state, stages with progress and time left, metrics, error, artifacts."""
+    with services.database.read_scope() as session:
+        job = service.view(services, session, job_id, request)
+    _hint_poll(response, job)
+    return job
+
+
+@router.post("/{job_id}/cancel", status_code=202, responses=responses(404, 409))
+def cancel_job(
+    job_id: str, services: ServicesDep, request: Request, response: Response
+) -> JobView:
+    """Ask a job to stop; asking twice changes nothing. The running stage stops within 10 s."""
+    service.cancel(services, job_id)
+    with services.database.read_scope() as session:
+        job = service.view(services, session, job_id, request)
+    _hint_poll(response, job)
+    return job
+
+
+@router.delete("/{job_id}", status_code=204, responses=responses(404, 409))
+def delete_job(job_id: str, services: ServicesDep) -> None:
+    """Delete a job and its bytes."""
+    service.delete(services, job_id)
+
+
+@router.get("/{job_id}/logs", responses=responses(404))
+def get_job_logs(
+    job_id: str,
+    services: ServicesDep,
+    stage: Annotated[StageName | None, Query(description="One stage; left out: all.")] = None,
+    line: Annotated[
+        int, Query(ge=-(2**31), lt=2**31, description="From this line on; negative: the tail.")
+    ] = 0,
+    limit: Annotated[int, Query(ge=1, le=10_000)] = 1000,
+) -> LogView:
+    """Lines that the stages wrote."""
+    with services.database.read_scope() as session:
+        queries.get_job(session, job_id)
+        page = records.read_logs(
+            session, job_id, stage=None if stage is None else str(stage), line=line, limit=limit
+        )
+    return LogView(
+        lines=page.lines, first=page.first, next=page.first + len(page.lines), total=page.total
+    )

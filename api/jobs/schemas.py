@@ -1,0 +1,168 @@
+"""What the API takes and says about jobs."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+
+from api.artifacts.schemas import ArtifactView
+from pipelines.registry import STAGE_NAMES
+from storage.models import Job, StageRow
+
+MAX_LABELS = 50
+_LABEL_KEY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._/-]{0,62}")
+_METRICS = ("psnr", "ssim", "lpips", "num_images", "width", "height")
+
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
+StageState = Literal[
+    "blocked", "ready", "running", "succeeded", "failed", "cancelled", "skipped"
+]
+StageName = StrEnum("StageName", {name: name for name in STAGE_NAMES})  # type: ignore[misc]
+
+
+def _checked_labels(labels: dict[str, str]) -> dict[str, str]:
+    for key in labels:
+        if not _LABEL_KEY.fullmatch(key):
+            raise ValueError(
+                "a label's key has 1 to 63 letters, digits, dots, dashes, underscores or slashes"
+            )
+    return labels
+
+
+LabelValue = Annotated[str, StringConstraints(max_length=255)]
+Labels = Annotated[
+    dict[str, LabelValue], Field(max_length=MAX_LABELS), AfterValidator(_checked_labels)
+]
+
+
+class JobRequest(BaseModel):
+    """What to make of a capture."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "capture_id": "019a5c0f1e2b0123456789abcdef",
+                    "preset": "preview",
+                    "options": {"train": {"max_steps": 500}},
+                    "labels": {"project": "garden"},
+                }
+            ]
+        },
+    )
+
+    capture_id: str = Field(max_length=64)
+    preset: str | None = Field(
+        None, max_length=64, description="A name from /v1/presets; left out: the service chooses."
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="{stage: {option: value}}, laid over the preset."
+    )
+    labels: Labels = Field(default_factory=dict, description="Free text to find the job by.")
+
+
+class JobErrorView(BaseModel):
+    """Why a job failed: what failed, on what, what to do."""
+
+    code: str
+    message: str
+    hint: str
+    stage: str | None = Field(None, description="The stage that failed.")
+    details: dict[str, Any] = Field(default_factory=dict)
+
+
+class StageView(BaseModel):
+    """One stage of a job."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    name: str
+    state: StageState
+    progress: float = Field(description="From 0 to 1.")
+    eta_s: float | None = Field(description="Seconds left, as far as that is known.")
+    attempt: int = Field(description="Which try this is; 0 before the first.")
+    message: str = Field(description="What it is doing.")
+    started_at: datetime | None
+    finished_at: datetime | None
+
+
+class JobSummary(BaseModel):
+    """A job as it stands in a list."""
+
+    id: str
+    state: JobState
+    preset: str
+    preset_reason: str = Field(description="Why this preset: asked for, or chosen because of ...")
+    options: dict[str, Any] = Field(description="The complete options of every stage.")
+    labels: dict[str, str]
+    capture_id: str
+    stages: list[StageView]
+    metrics: dict[str, float | int | None] | None = Field(
+        description="Held-out quality, once measured: psnr in dB, ssim, num_images, width, height."
+    )
+    error: JobErrorView | None
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    cancel_requested_at: datetime | None
+
+    @staticmethod
+    def fields_of(job: Job) -> dict[str, Any]:
+        """The values of a loaded record."""
+        return {
+            "id": job.id,
+            "state": job.state,
+            "preset": job.preset,
+            "preset_reason": job.preset_reason,
+            "options": job.options,
+            "labels": job.labels,
+            "capture_id": job.capture_id,
+            "stages": [StageView.model_validate(row) for row in job.stages],
+            "metrics": metrics_of(job.stages),
+            "error": None if job.error is None else JobErrorView.model_validate(job.error),
+            "created_at": job.created_at,
+            "started_at": job.started_at,
+            "finished_at": job.finished_at,
+            "cancel_requested_at": job.cancel_requested_at,
+        }
+
+    @classmethod
+    def of(cls, job: Job) -> JobSummary:
+        """The view of a record."""
+        return cls(**cls.fields_of(job))
+
+
+class JobView(JobSummary):
+    """A job."""
+
+    queue_position: int | None = Field(description="1 is served next; null once it runs.")
+    artifacts: list[ArtifactView] = Field(description="What can be downloaded so far.")
+
+
+class JobPage(BaseModel):
+    """A page of jobs, newest first."""
+
+    items: list[JobSummary]
+    next_cursor: str | None = Field(description="Give it as `cursor` for the next page.")
+
+
+class LogView(BaseModel):
+    """Lines that the stages wrote."""
+
+    lines: list[str]
+    first: int = Field(description="The number of the first line here; the first of all is 0.")
+    next: int = Field(description="Give it as `line` to go on from here.")
+    total: int = Field(description="Lines there are so far.")
+
+
+def metrics_of(stages: list[StageRow]) -> dict[str, float | int | None] | None:
+    """Held-out quality from the evaluation's summary, or None before there is one."""
+    for row in stages:
+        if row.name == "evaluate" and row.state == "succeeded" and row.summary:
+            return {key: row.summary[key] for key in _METRICS if key in row.summary}
+    return None

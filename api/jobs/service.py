@@ -1,0 +1,110 @@
+"""Jobs: which preset, which options, which stages; then the records and the bell."""
+
+from __future__ import annotations
+
+from fastapi import BackgroundTasks, Request
+from sqlalchemy.orm import Session
+
+from api.artifacts import service as artifacts
+from api.deps import Services
+from api.jobs.schemas import JobRequest, JobView
+from api.problems import ConflictedError, FieldProblem, InvalidRequestError
+from pipelines.options import PRESETS, resolve_options
+from pipelines.registry import STAGES, skipped_stages
+from storage import jobs, queries, records
+from storage.deletions import drain_deletions
+from storage.jobs import StageSeed
+from storage.models import Job
+
+PRESET_WITH_GPU = "standard"
+PRESET_WITHOUT_GPU = "preview"
+
+
+def default_preset(session: Session) -> tuple[str, str]:
+    """The preset of a job that names none, and why it is that one."""
+    if records.has_live_gpu(session):
+        return PRESET_WITH_GPU, "no preset was asked for, and a GPU worker is registered"
+    return PRESET_WITHOUT_GPU, "no preset was asked for, and no GPU worker is registered"
+
+
+def choose_preset(session: Session, asked: str | None) -> tuple[str, str]:
+    """The preset and the reason. Raises InvalidRequestError for one that does not exist."""
+    if asked is None:
+        return default_preset(session)
+    if asked not in PRESETS:
+        known = ", ".join(PRESETS)
+        raise InvalidRequestError(
+            f"There is no preset of that name; there are {known}.",
+            code="preset_unknown",
+            hint="GET /v1/presets lists them; leave it out and the service chooses.",
+            errors=[FieldProblem(path="preset", detail=f"one of {known}")],
+        )
+    return asked, "asked for"
+
+
+def stage_seeds(kind: str) -> list[StageSeed]:
+    """The stages of a job on a capture of this kind."""
+    skipped = skipped_stages(kind)
+    return [
+        StageSeed(stage.name, stage.after, stage.needs_gpu, stage.name in skipped)
+        for stage in STAGES
+    ]
+
+
+def create(services: Services, wanted: JobRequest, background: BackgroundTasks) -> str:
+    """Record a job; workers are told after the answer went out. Returns the job's id.
+
+    Everything is checked before anything is written. Raises NotFoundError (capture),
+    InvalidRequestError (preset), OptionsError.
+    """
+    with services.database.read_scope() as session:
+        kind = records.get_capture(session, wanted.capture_id).kind
+        preset, reason = choose_preset(session, wanted.preset)
+    options = resolve_options(preset, wanted.options)
+    with services.database.session_scope() as session:
+        job = jobs.create_job(
+            session,
+            capture_id=wanted.capture_id,
+            preset=preset,
+            preset_reason=reason,
+            options=options,
+            stages=stage_seeds(kind),
+            labels=wanted.labels,
+        )
+        ready = jobs.ready_stage_ids(job)
+        job_id = job.id
+    background.add_task(services.bell.ring, services.database, ready)
+    return job_id
+
+
+def view(services: Services, session: Session, job_id: str, request: Request) -> JobView:
+    """A job with all that the API says of it. Raises NotFoundError."""
+    job = queries.get_job(session, job_id, manifests=True)
+    return JobView(
+        **JobView.fields_of(job),
+        queue_position=queries.queue_position(session, job),
+        artifacts=artifacts.list_of(services, job, request),
+    )
+
+
+def cancel(services: Services, job_id: str) -> None:
+    """Ask a job to stop. Raises ConflictedError where it ended otherwise already."""
+    with services.database.session_scope() as session:
+        job = jobs.request_cancel(session, job_id)
+        _check_cancelled(job)
+
+
+def _check_cancelled(job: Job) -> None:
+    if job.state in ("succeeded", "failed"):
+        raise ConflictedError(
+            f"The job has {job.state} already.",
+            code="job_finished",
+            hint="There is nothing left to cancel; DELETE removes it.",
+        )
+
+
+def delete(services: Services, job_id: str) -> None:
+    """Delete a job and its bytes. Raises ConflictError while it runs."""
+    with services.database.session_scope() as session:
+        jobs.delete_job(session, job_id)
+    drain_deletions(services.database, services.store)

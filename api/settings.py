@@ -1,0 +1,51 @@
+"""The API's settings, from the environment with the prefix NERFWORKS_."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field, SecretStr
+from pydantic_settings import SettingsConfigDict
+
+from storage.settings import StorageSettings
+
+
+class ApiSettings(StorageSettings):
+    """What the API needs besides the settings of the records, the broker and the objects."""
+
+    model_config = SettingsConfigDict(env_prefix="NERFWORKS_", extra="ignore", frozen=True)
+
+    host: str = Field("127.0.0.1", description="Address to listen on.")
+    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 for a free one.")
+    max_upload_bytes: int = Field(
+        20 * 2**30, ge=1, description="Largest capture that is taken, in bytes."
+    )
+    min_free_bytes: int = Field(
+        2**30, ge=0, description="Bytes that an upload must leave free on the staging disk."
+    )
+    max_body_bytes: int = Field(
+        2**20, ge=2**10, description="Largest body of any other call, in bytes."
+    )
+    url_expires_s: int = Field(
+        900, ge=60, le=604_800, description="How long a signed download URL is good, in seconds."
+    )
+    check_timeout_s: float = Field(
+        3.0, gt=0, le=60, description="How long /readyz waits for each part, in seconds."
+    )
+    bootstrap_api_key: SecretStr = Field(
+        SecretStr(""), description="A key that is made valid at the start; empty for none."
+    )
+    bootstrap_api_key_file: Path | None = Field(
+        None, description="A file that holds such a key (a mounted secret)."
+    )
+
+    @property
+    def staging_dir(self) -> Path:
+        """Where uploads are written while they come in."""
+        return self.home.resolve() / "staging"
+
+    def bootstrap_key(self) -> str:
+        """The key to make valid at the start, or "". Raises OSError for a file that is missing."""
+        if self.bootstrap_api_key_file is not None:
+            return self.bootstrap_api_key_file.read_text("utf-8").strip()
+        return self.bootstrap_api_key.get_secret_value()

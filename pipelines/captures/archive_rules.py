@@ -1,0 +1,186 @@
+"""What a zip archive must be like before anything in it is used. Standard library only.
+
+An entry's name is only ever looked up, never made into a path of ours; yet an archive with a
+hostile name is refused as a whole, since nobody sends one by accident. Headers can lie about
+sizes: `pipelines.captures.unpack` counts again while it reads.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from pipelines.captures.magic import HEAD_BYTES, is_zip
+from pipelines.errors import CaptureError
+
+READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError)
+"""What `zipfile` raises for an archive that is damaged or lies about itself."""
+
+_LOCAL_HEADER_BYTES = 30
+_ENCRYPTED_BITS = 0x1 | 0x40 | 0x2000
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_SMALL_BYTES = 4 << 20
+_JUNK_NAMES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+
+
+@dataclass(frozen=True)
+class ArchiveLimits:
+    """How large an archive may be.
+
+    max_ratio: unpacked to packed size, for entries and the whole; pictures hardly shrink at all.
+    """
+
+    max_entries: int = 50_000
+    max_unpacked_bytes: int = 20 * 2**30
+    max_ratio: float = 100.0
+
+
+def _unsafe(message: str) -> CaptureError:
+    return CaptureError(
+        message,
+        code="archive_unsafe",
+        hint="Make the archive again from the plain folder, with an ordinary zip program.",
+    )
+
+
+def _bomb(message: str, hint: str) -> CaptureError:
+    return CaptureError(message, code="archive_bomb", hint=hint)
+
+
+def shown(name: str) -> str:
+    """An entry's name as it may appear in a message: printable, short."""
+    clean = "".join(letter if letter.isprintable() else "?" for letter in name)
+    return clean if len(clean) <= 80 else clean[:77] + "..."
+
+
+def is_junk(name: str) -> bool:
+    """Whether an entry is an operating system's litter: `__MACOSX/`, `._*`, `.DS_Store`."""
+    parts = PurePosixPath(name).parts
+    return (
+        not parts or "__MACOSX" in parts or parts[-1].startswith("._") or parts[-1] in _JUNK_NAMES
+    )
+
+
+def _check_name(info: zipfile.ZipInfo) -> None:
+    # ZipInfo.filename ends at the first NUL; the name as stored is in orig_filename.
+    name = info.orig_filename
+    bad = (
+        not name
+        or "\0" in name
+        or "\\" in name
+        or name.startswith("/")
+        or re.match(r"[A-Za-z]:", name)
+        or ".." in name.split("/")
+    )
+    if bad:
+        raise _unsafe(f'The archive has an entry with an unsafe name: "{shown(name)}".')
+
+
+def _check_type(info: zipfile.ZipInfo) -> None:
+    kind = stat.S_IFMT(info.external_attr >> 16)
+    if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        raise _unsafe(f'The archive has a link or a device: "{shown(info.filename)}".')
+    if info.flag_bits & _ENCRYPTED_BITS:
+        raise CaptureError(
+            "The archive is encrypted.",
+            code="archive_encrypted",
+            hint="Send an archive without a password.",
+        )
+    if info.compress_type not in _METHODS:
+        raise _unsafe(
+            f'The archive has an entry packed in an unusual way: "{shown(info.filename)}".'
+        )
+
+
+def _check_sizes(entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> None:
+    total = packed = 0
+    for info in entries:
+        total += info.file_size
+        packed += info.compress_size
+        ratio = info.file_size / max(info.compress_size, 1)
+        if info.file_size > _SMALL_BYTES and ratio > limits.max_ratio:
+            raise _bomb(
+                f"The archive has an entry that unpacks to {ratio:.0f} times its size: "
+                f'"{shown(info.filename)}".',
+                "Send an archive of photos, or of an app's export, and nothing else.",
+            )
+    if total > limits.max_unpacked_bytes:
+        raise _bomb(
+            f"The archive unpacks to {total / 2**30:.1f} GiB; "
+            f"{limits.max_unpacked_bytes / 2**30:.1f} GiB are allowed.",
+            "Send fewer or smaller pictures.",
+        )
+    if total > _SMALL_BYTES and total / max(packed, 1) > limits.max_ratio:
+        raise _bomb(
+            f"The archive unpacks to {total / max(packed, 1):.0f} times its size.",
+            "Send an archive of photos, or of an app's export, and nothing else.",
+        )
+
+
+def _check_overlap(archive: zipfile.ZipFile, entries: Sequence[zipfile.ZipInfo]) -> None:
+    """No two entries share bytes: a bomb can otherwise pack one payload under many names."""
+    ordered = sorted(entries, key=lambda info: info.header_offset)
+    starts = [info.header_offset for info in ordered[1:]] + [archive.start_dir]
+    for info, next_start in zip(ordered, starts, strict=True):
+        end = info.header_offset + _LOCAL_HEADER_BYTES + info.compress_size
+        if end > next_start:
+            raise _bomb(
+                "The archive has entries that share the same bytes.",
+                "Make the archive again with an ordinary zip program.",
+            )
+
+
+def _check_duplicates(entries: Sequence[zipfile.ZipInfo]) -> None:
+    seen: set[str] = set()
+    for info in entries:
+        if info.filename in seen:
+            raise _unsafe(f'The archive has two entries of one name: "{shown(info.filename)}".')
+        seen.add(info.filename)
+
+
+def checked_entries(archive: zipfile.ZipFile, limits: ArchiveLimits) -> dict[str, zipfile.ZipInfo]:
+    """The archive's files by name, litter and folders left out, once all of it was checked.
+
+    Raises CaptureError: archive_unsafe, archive_bomb, archive_encrypted.
+    """
+    entries = archive.infolist()
+    if len(entries) > limits.max_entries:
+        raise _bomb(
+            f"The archive has {len(entries)} entries; {limits.max_entries} are allowed.",
+            "Send fewer pictures.",
+        )
+    for info in entries:
+        _check_name(info)
+        _check_type(info)
+    _check_duplicates(entries)
+    _check_sizes(entries, limits)
+    _check_overlap(archive, entries)
+    return {
+        info.filename: info for info in entries if not info.is_dir() and not is_junk(info.filename)
+    }
+
+
+def head_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    """The first bytes of an entry. Raises CaptureError where it is a zip itself, or damaged."""
+    try:
+        with archive.open(info) as file:
+            head = file.read(HEAD_BYTES)
+    except READ_ERRORS as error:
+        raise damaged() from error
+    if is_zip(head):
+        raise _unsafe(f'The archive holds another archive: "{shown(info.filename)}".')
+    return head
+
+
+def damaged() -> CaptureError:
+    """The error for an archive that cannot be read."""
+    return CaptureError(
+        "The archive is damaged or cut off.",
+        code="archive_damaged",
+        hint="Make the archive again, or upload it again.",
+    )

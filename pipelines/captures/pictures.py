@@ -1,0 +1,236 @@
+"""Pictures out of an archive: decoded to be sure, and written without any metadata.
+
+A photo's EXIF may hold where it was taken; nothing of it reaches a later stage. Photos without
+poses are turned upright by their EXIF orientation; pictures with poses are not, since their
+intrinsics speak of the pixels as stored.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import PIL.Image
+import PIL.ImageFile
+import PIL.ImageOps
+
+from pipelines.captures.archive_rules import shown
+from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
+
+FORMATS = ("JPEG", "PNG", "WEBP")
+JPEG_QUALITY = 95
+MIN_IMAGES = 3
+# Segments of a JPEG that hold nothing private: JFIF and Adobe's note on the colour transform.
+_HARMLESS_SEGMENTS = frozenset({"APP0", "APP14"})
+_HARMLESS_PNG_KEYS = frozenset({"dpi", "gamma", "srgb", "aspect", "interlace"})
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as written. file: relative to the stage's folder. source: its name as sent."""
+
+    file: str
+    source: str
+    width: int
+    height: int
+
+    def as_dict(self) -> dict[str, str | int]:
+        """As plain JSON, for `capture.json`."""
+        return {
+            "file": self.file,
+            "source": self.source,
+            "width": self.width,
+            "height": self.height,
+        }
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sorts names as people count: "2.jpg" before "10.jpg"."""
+    return tuple(
+        (0, int(part), "") if part.isdigit() and part.isascii() else (1, 0, part)
+        for part in re.split(r"([0-9]+)", name)
+        if part
+    )
+
+
+def evenly_picked(count: int, most: int) -> list[int]:
+    """At most `most` indices of `count`, at even distances, first and last among them."""
+    if count <= most:
+        return list(range(count))
+    if most == 1:
+        return [0]
+    return [round(step * (count - 1) / (most - 1)) for step in range(most)]
+
+
+class PictureWriter:
+    """Writes pictures of one archive to `out/images` and masks to `out/masks`.
+
+    upright: whether the EXIF orientation is applied (photos) or only dropped (posed pictures).
+    """
+
+    def __init__(
+        self, archive: CaptureArchive, out: Path, *, max_pixels: int, upright: bool
+    ) -> None:
+        self._archive = archive
+        self._out = out
+        self._max_pixels = max_pixels
+        self._upright = upright
+        self._raw = out / ".raw"
+        for folder in ("images", "masks"):
+            (out / folder).mkdir(parents=True, exist_ok=True)
+
+    def close(self) -> None:
+        """Remove what was only needed while writing."""
+        self._raw.unlink(missing_ok=True)
+        if not any((self._out / "masks").iterdir()):
+            (self._out / "masks").rmdir()
+
+    def store(self, name: str, number: int) -> Picture:
+        """Decode the picture `name` and write it as `images/<number>`.
+
+        Raises CaptureError image_undecodable.
+        """
+        kind = self._archive.image_format(name)
+        self._archive.extract(name, self._raw)
+        with self._opened(name, kind) as image:
+            orientation = image.getexif().get(0x0112, 1)
+            turned = self._upright and orientation in range(2, 9)
+            suffix = ".png" if kind == "PNG" else ".jpg"
+            file = f"images/{number:05d}{suffix}"
+            target = self._out / file
+            if not turned and _is_clean(image, self._raw):
+                shutil.copyfile(self._raw, target)
+                return Picture(file, name, image.width, image.height)
+            upright = PIL.ImageOps.exif_transpose(image) if turned else image
+            plain = _plain_rgb(upright)
+            if suffix == ".png":
+                plain.save(target, "PNG", compress_level=3)
+            else:
+                plain.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+            return Picture(file, name, plain.width, plain.height)
+
+    def store_mask(self, name: str, number: int, size: tuple[int, int]) -> str:
+        """Write the mask `name` as a one-channel PNG of `size`; returns its path below `out`.
+
+        Raises CaptureError image_undecodable, also where the size differs.
+        """
+        self._archive.extract(name, self._raw)
+        with self._opened(name, self._archive.image_format(name)) as image:
+            if image.size != size:
+                raise CaptureError(
+                    f'The mask "{shown(name)}" is {image.width}x{image.height}, its picture '
+                    f"{size[0]}x{size[1]}.",
+                    code="image_undecodable",
+                    hint="Masks must have the size of their pictures.",
+                )
+            file = f"masks/{number:05d}.png"
+            PIL.Image.frombytes("L", image.size, image.convert("L").tobytes()).save(
+                self._out / file
+            )
+        return file
+
+    def _opened(self, name: str, kind: str) -> PIL.Image.Image:
+        """The extracted picture, fully decoded."""
+        try:
+            with warnings.catch_warnings():
+                # Pillow only warns between its limit and twice that; our own limit is an error.
+                warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
+                image = PIL.Image.open(self._raw, formats=[kind])
+            if image.width * image.height > self._max_pixels:
+                raise _undecodable(
+                    name,
+                    f"has {image.width}x{image.height} pixels; {self._max_pixels} are allowed",
+                )
+            image.load()
+        except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                raise  # the disk's fault, not the picture's
+            raise _undecodable(name, "does not decode") from error
+        return image
+
+
+def _undecodable(name: str, why: str) -> CaptureError:
+    return CaptureError(
+        f'The picture "{shown(name)}" {why}.',
+        code="image_undecodable",
+        hint="Replace the picture, or leave it out.",
+    )
+
+
+def _is_clean(image: PIL.Image.Image, raw: Path) -> bool:
+    """Whether the bytes can be kept as they came: plain RGB, and nothing but the picture."""
+    if image.mode != "RGB":
+        return False
+    if image.format == "JPEG":
+        segments = {name for name, _ in getattr(image, "applist", [])}
+        return (
+            segments <= _HARMLESS_SEGMENTS and "comment" not in image.info and _ends_at_its_end(raw)
+        )
+    if image.format == "PNG":
+        return set(image.info) <= _HARMLESS_PNG_KEYS and not getattr(image, "text", {})
+    return False
+
+
+def _ends_at_its_end(raw: Path) -> bool:
+    """Whether a JPEG has nothing behind its end marker (phones append further pictures there)."""
+    data = raw.read_bytes()
+    return data.rstrip(b"\0").endswith(b"\xff\xd9") and data.count(b"\xff\xd8\xff") == 1
+
+
+def _plain_rgb(image: PIL.Image.Image) -> PIL.Image.Image:
+    """The pixels as 8-bit RGB over white, in a new image that carries no metadata."""
+    if image.mode.startswith("I;16") or image.mode == "I":
+        image = image.convert("I").point(lambda value: value / 257).convert("L")
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        layer = image.convert("RGBA")
+        image = PIL.Image.new("RGB", layer.size, (255, 255, 255))
+        image.paste(layer, mask=layer.getchannel("A"))
+    rgb = image.convert("RGB")
+    clean = PIL.Image.new("RGB", rgb.size)
+    clean.paste(rgb)
+    return clean
+
+
+def store_all(
+    writer: PictureWriter, names: Sequence[str], on_done: Callable[[int], None]
+) -> tuple[dict[str, Picture], list[str]]:
+    """Write pictures in order; those that do not decode are left out if they are few.
+
+    on_done: called after each with how many are done.
+    Returns the pictures by name, and warnings. Raises CaptureError: image_undecodable where more
+    than one in ten does not decode, too_few_images where fewer than three are left.
+    """
+    pictures: dict[str, Picture] = {}
+    failures: list[CaptureError] = []
+    for done, name in enumerate(names, start=1):
+        try:
+            pictures[name] = writer.store(name, len(pictures) + 1)
+        except CaptureError as error:
+            if error.code != "image_undecodable":
+                raise
+            failures.append(error)
+        on_done(done)
+    if len(failures) * 10 > len(names):
+        raise CaptureError(
+            f"{len(failures)} of {len(names)} pictures cannot be used. {failures[0].message}",
+            code="image_undecodable",
+            hint="Check that the pictures open, and pack them again.",
+            details={"failed": [error.message for error in failures[:20]]},
+        )
+    require_enough(len(pictures))
+    return pictures, [f"Left out: {error.message}" for error in failures]
+
+
+def require_enough(count: int) -> None:
+    """Raise CaptureError too_few_images where no reconstruction could be made."""
+    if count < MIN_IMAGES:
+        raise CaptureError(
+            f"There are {count} usable pictures; at least {MIN_IMAGES} are needed.",
+            code="too_few_images",
+            hint="Send more pictures of the subject, 30 or more for a good result.",
+        )

@@ -1,0 +1,50 @@
+"""`ingest/capture.json`: what a capture is, for every later stage and for the report."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+CAPTURE_JSON = "capture.json"
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """What ingest found and wrote.
+
+    kind: one of `sniff.KINDS`. filename: what the sender called it; a label, never a path.
+    sha256: of the bytes that were sent.
+    num_images: pictures in `ingest/images`; 0 for a video.
+    video: `VideoInfo` as plain data, for a video.
+    images: file (relative to `ingest/`), source (name in the archive), width, height.
+    """
+
+    kind: str
+    filename: str
+    sha256: str
+    num_images: int = 0
+    video: dict[str, Any] | None = None
+    images: list[dict[str, Any]] = field(default_factory=list)
+    details: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def save(self, folder: Path) -> None:
+        """Write `capture.json` into the stage's folder."""
+        (folder / CAPTURE_JSON).write_text(json.dumps(asdict(self), indent=1), "utf-8")
+
+    @classmethod
+    def load(cls, folder: Path) -> CaptureRecord:
+        """Read what `save` wrote. Raises FileNotFoundError, and TypeError for another format."""
+        return cls(**json.loads((folder / CAPTURE_JSON).read_text("utf-8")))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the reader of one kind of capture has written below the stage's folder."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    video: dict[str, Any] | None = None
+    details: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)

@@ -1,0 +1,43 @@
+"""Which pairs of images are matched. Pairs are (i, j), i < j, indices in capture order."""
+
+from __future__ import annotations
+
+import math
+
+Pairs = list[tuple[int, int]]
+
+MAX_EXHAUSTIVE_PHOTOS = 200
+"""Photos beyond this are matched by file name first."""
+SHORT_SEQUENCE = 30
+"""Up to here, all pairs cost no more than a sequence's."""
+
+
+def sequential_pairs(num: int, overlap: int) -> Pairs:
+    """Each image with its next `overlap`, and with those 2, 4, 8, ... further on."""
+    steps = set(range(1, overlap + 1)) | {2**k for k in range(num.bit_length())}
+    return sorted((i, i + step) for step in steps for i in range(num - step))
+
+
+def spaced_pairs(num: int) -> Pairs:
+    """All pairs among about 2 sqrt(num) evenly spaced images, so that a loop closes."""
+    count = min(num, max(8, round(2 * math.sqrt(num))))
+    chosen = sorted({round(i * (num - 1) / max(count - 1, 1)) for i in range(count)})
+    return [(i, j) for position, i in enumerate(chosen) for j in chosen[position + 1 :]]
+
+
+def exhaustive_pairs(num: int) -> Pairs:
+    """All pairs."""
+    return [(i, j) for i in range(num) for j in range(i + 1, num)]
+
+
+def plan_pairs(num: int, matcher: str, overlap: int, *, is_video: bool) -> tuple[str, Pairs]:
+    """The first attempt's pairs, and what they are called: sequential or exhaustive.
+
+    matcher: auto, sequential or exhaustive. auto: all pairs for photos and short sequences.
+    """
+    if matcher == "auto":
+        limit = SHORT_SEQUENCE if is_video else MAX_EXHAUSTIVE_PHOTOS
+        matcher = "exhaustive" if num <= limit else "sequential"
+    if matcher == "exhaustive":
+        return matcher, exhaustive_pairs(num)
+    return matcher, sorted({*sequential_pairs(num, overlap), *spaced_pairs(num)})

@@ -1,0 +1,218 @@
+"""What came of a reconstruction: is it usable, and why were images left out."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+from pipelines.errors import PosesError
+from pipelines.options import PosesOptions
+from pipelines.sfm.source import Source
+from pipelines.tools.colmap import PairStatistics, SparseModel, best_model
+
+MIN_FEATURES = 100
+"""An image with fewer features cannot be placed."""
+MIN_INLIERS = 30
+"""Verified matches with its best partner below which an image is rarely placed (COLMAP's
+abs_pose_min_num_inliers)."""
+MIN_ANGLE_DEG = 2.0
+"""Median triangulation angle below which depth is not determined; COLMAP drops points < 1.5."""
+MAX_ROTATION_SHARE = 0.7
+"""Share of verified pairs that a rotation explains, above which the camera did not travel."""
+
+_MOVE_HINT = (
+    "Move sideways around the subject while filming: turning on the spot, or holding still, "
+    "shows nothing of depth."
+)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One run of the mapper. matcher: which pairs; models: all it found, in COLMAP's order."""
+
+    matcher: str
+    relaxed: bool
+    models: tuple[SparseModel, ...]
+    seconds: float
+
+    @property
+    def best(self) -> SparseModel | None:
+        """The model with most images."""
+        return best_model(self.models)
+
+    @property
+    def num_registered(self) -> int:
+        """Images in the best model."""
+        return 0 if self.best is None else len(self.best.indices)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All attempts on a capture, at least one, and what matching found."""
+
+    attempts: tuple[Attempt, ...]
+    statistics: PairStatistics
+
+    @property
+    def chosen(self) -> Attempt:
+        """The attempt that placed most images; the earliest among equals."""
+        return max(self.attempts, key=lambda attempt: attempt.num_registered)
+
+
+def only_rotates(statistics: PairStatistics) -> bool:
+    """Whether matching worked, and pure rotation explains nearly all of what matched."""
+    enough = statistics.num_verified >= 0.5 * len(statistics.num_features)
+    return enough and (statistics.num_rotation_only > MAX_ROTATION_SHARE * statistics.num_verified)
+
+
+def num_needed(num_images: int, options: PosesOptions) -> int:
+    """How many images must register for the job to go on."""
+    return max(options.min_registered, math.ceil(options.min_registered_ratio * num_images))
+
+
+def check_features(statistics: PairStatistics, options: PosesOptions) -> None:
+    """Raise PosesError (no_features) where too few images hold anything to match."""
+    num = len(statistics.num_features)
+    usable = int((statistics.num_features >= MIN_FEATURES).sum())
+    if usable < min(num_needed(num, options), num):
+        raise PosesError(
+            f"{usable} of {num} images show enough detail to find camera poses.",
+            code="no_features",
+            hint="Film in good light, hold still enough for sharp frames, and have textured "
+            "things in view; blank walls and dark or blurred frames cannot be placed.",
+            details={"num_images": num, "num_usable": usable},
+        )
+
+
+def check_usable(outcome: Outcome, source: Source, options: PosesOptions) -> SparseModel:
+    """The model to go on with.
+
+    Raises PosesError: no_parallax where the camera turned or stood still, else too_few_registered.
+    """
+    num = len(source.files)
+    model = outcome.chosen.best
+    placed = 0 if model is None else len(model.indices)
+    needed = num_needed(num, options)
+    details: dict[str, Any] = {"num_images": num, "num_registered": placed, "num_needed": needed}
+    if model is not None and placed >= needed:
+        if model.angle_deg >= MIN_ANGLE_DEG:
+            return model
+        raise PosesError(
+            f"The camera hardly moved: the same point is seen from directions only "
+            f"{model.angle_deg:.1f} degrees apart.",
+            code="no_parallax",
+            hint=_MOVE_HINT,
+            details=details | {"angle_deg": model.angle_deg},
+        )
+    if only_rotates(outcome.statistics):
+        raise PosesError(
+            f"The camera turned or stood still instead of moving: {placed} of {num} "
+            f"{_noun(source)} registered.",
+            code="no_parallax",
+            hint=_MOVE_HINT,
+            details=details,
+        )
+    reasons = Counter(entry["code"] for entry in unregistered_images(outcome, source))
+    raise PosesError(
+        f"{placed} of {num} {_noun(source)} registered, at least {needed} are needed.",
+        code="too_few_registered",
+        details=details | {"reasons": dict(reasons)},
+    )
+
+
+def unregistered_images(outcome: Outcome, source: Source) -> list[dict[str, Any]]:
+    """For each image left out: file, timestamp_s, code and reason."""
+    model = outcome.chosen.best
+    placed = set() if model is None else set(model.indices)
+    others: dict[int, int] = {}
+    for other in outcome.chosen.models:
+        if other is not model:
+            for index in other.indices:
+                others[index] = max(others.get(index, 0), len(other.indices))
+    entries = []
+    for index, (file, seconds) in enumerate(zip(source.files, source.timestamps_s, strict=True)):
+        if index not in placed:
+            code, reason = _reason(index, others, outcome.statistics)
+            entries.append({"file": file, "timestamp_s": seconds, "code": code, "reason": reason})
+    return entries
+
+
+def _reason(index: int, others: dict[int, int], statistics: PairStatistics) -> tuple[str, str]:
+    """Why an image is not in the chosen model: a stable code and words."""
+    num_features = int(statistics.num_features[index])
+    inliers = int(statistics.best_inliers[index])
+    if index in others:
+        return "other_model", f"in another, smaller model of {others[index]} images"
+    if num_features < MIN_FEATURES:
+        return "too_few_features", f"too few features ({num_features})"
+    if inliers < MIN_INLIERS:
+        return "too_few_matches", f"too few matches with its neighbours (at most {inliers})"
+    return "pose_rejected", "matched its neighbours, but no pose fitted what is known of the scene"
+
+
+def gaps(outcome: Outcome, source: Source) -> list[tuple[float, float]]:
+    """Stretches of a video without poses: (first, last) seconds of unregistered frames."""
+    model = outcome.chosen.best
+    placed = set() if model is None else set(model.indices)
+    found: list[tuple[float, float]] = []
+    previous = -2
+    for index, seconds in enumerate(source.timestamps_s):
+        if seconds is None or index in placed:
+            continue
+        if index == previous + 1 and found:
+            found[-1] = (found[-1][0], seconds)
+        else:
+            found.append((seconds, seconds))
+        previous = index
+    return found
+
+
+def build_report(
+    outcome: Outcome, model: SparseModel, source: Source, world: dict[str, Any]
+) -> dict[str, Any]:
+    """The contents of report.json. world: how the frame was chosen, added as it is."""
+    num = len(source.files)
+    statistics = outcome.statistics
+    return {
+        "num_images": num,
+        "num_registered": len(model.indices),
+        "registered_ratio": len(model.indices) / num,
+        "mean_reprojection_error_px": model.error_px,
+        "median_triangulation_angle_deg": model.angle_deg,
+        "num_points": len(model.points),
+        "num_cameras": len(model.cameras),
+        "models": [
+            {
+                "num_images": len(found.indices),
+                "num_points": len(found.points),
+                "chosen": found is model,
+            }
+            for found in outcome.chosen.models
+        ],
+        "attempts": [
+            {
+                "matcher": attempt.matcher,
+                "relaxed": attempt.relaxed,
+                "num_registered": attempt.num_registered,
+                "model_sizes": [len(found.indices) for found in attempt.models],
+                "seconds": round(attempt.seconds, 2),
+                "chosen": attempt is outcome.chosen,
+            }
+            for attempt in outcome.attempts
+        ],
+        "matching": {
+            "num_pairs": statistics.num_pairs,
+            "num_verified": statistics.num_verified,
+            "num_rotation_only": statistics.num_rotation_only,
+            "mean_features": float(statistics.num_features.mean()),
+        },
+        "world": world,
+        "unregistered": unregistered_images(outcome, source),
+        "gaps_s": gaps(outcome, source),
+    }
+
+
+def _noun(source: Source) -> str:
+    return "frames" if source.is_video else "images"

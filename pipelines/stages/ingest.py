@@ -1,0 +1,93 @@
+"""Stage `ingest`: what was sent, checked, and its pictures and poses in our own form.
+
+Writes `capture.json` (always), `images/` (photos and app exports), `masks/` and `cameras.json`
+(captures with poses). A video stays where it is: `frames` reads the upload.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from pipelines.captures import images, nerfstudio, polycam, record3d, video
+from pipelines.captures.archive_rules import ArchiveLimits
+from pipelines.captures.record import CaptureRecord, Found
+from pipelines.captures.sniff import Sniffed, sniff
+from pipelines.errors import CaptureError
+from pipelines.options import IngestOptions
+from pipelines.stage import StageContext
+
+_POSED_READERS = {
+    "nerfstudio": nerfstudio.read,
+    "polycam": polycam.read,
+    "record3d": record3d.read,
+}
+
+
+def run(options: IngestOptions, ctx: StageContext) -> dict[str, Any]:
+    """Check and unpack the upload. Returns the summary for the report.
+
+    Raises CaptureError with one of the codes listed at that class.
+    """
+    path = ctx.workspace.capture_file
+    if not path.is_file():
+        raise CaptureError(
+            "There is no uploaded file in the job's folder.",
+            code="capture_missing",
+            hint="Upload the capture, or name it with --input.",
+        )
+    filename = _filename(ctx)
+    ctx.progress(0.0, "Looking at the file")
+    found_kind = sniff(path, filename, ArchiveLimits(max_unpacked_bytes=options.max_unpacked_bytes))
+    found = _read(found_kind, path, options, ctx)
+    record = CaptureRecord(
+        kind=found_kind.kind,
+        filename=filename,
+        sha256=sha256_of(path),
+        num_images=len(found.images),
+        video=found.video,
+        images=found.images,
+        details=found.details,
+        warnings=found.warnings,
+    )
+    record.save(ctx.out)
+    for warning in record.warnings:
+        ctx.logger.warning("%s", warning)
+    ctx.progress(1.0, f"{record.kind}: {_what(record)}")
+    return {
+        "kind": record.kind,
+        "filename": record.filename,
+        "num_images": record.num_images,
+        **record.details,
+        "warnings": record.warnings,
+    }
+
+
+def _read(sniffed: Sniffed, path: Path, options: IngestOptions, ctx: StageContext) -> Found:
+    if sniffed.kind == "video":
+        return video.read(path, options, ctx)
+    if sniffed.kind == "images":
+        return images.read(path, options, ctx)
+    return _POSED_READERS[sniffed.kind](path, str(sniffed.details["root"]), options, ctx)
+
+
+def _filename(ctx: StageContext) -> str:
+    """What the sender called the file; a label only."""
+    if not ctx.workspace.job_file.is_file():
+        return "capture"
+    job = json.loads(ctx.workspace.job_file.read_text("utf-8"))
+    return str(job.get("filename", "capture"))
+
+
+def _what(record: CaptureRecord) -> str:
+    if record.video is None:
+        return f"{record.num_images} pictures"
+    return f"{record.video['num_frames']} frames, {record.video['duration_s']:.1f} s"
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

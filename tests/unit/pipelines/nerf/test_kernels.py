@@ -1,0 +1,202 @@
+"""Every compiled kernel against its plain twin."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipelines.nerf.config import HashGridConfig, NerfactoConfig, ProposalConfig
+from pipelines.nerf.encodings import HashGrid
+from pipelines.nerf.kernels.dense_layers import TILE, apply_layer, pack_layer
+from pipelines.nerf.kernels.hash_grid import hash_encode_fast
+from pipelines.nerf.kernels.render_rays import pack_model, render_rays
+from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.rays import Rays
+
+SMALL = HashGridConfig(num_levels=5, max_res=100, log2_table_size=12)
+
+
+@pytest.fixture(params=[1, 2], ids=["one thread", "two threads"])
+def threads(request: pytest.FixtureRequest) -> int:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    request.addfinalizer(lambda: torch.set_num_threads(before))
+    return int(request.param)
+
+
+def random_grid(config: HashGridConfig) -> HashGrid:
+    torch.manual_seed(0)
+    grid = HashGrid(config)
+    grid.table.data.normal_()
+    return grid
+
+
+@pytest.mark.parametrize("num_features", [1, 2, 4])
+def test_hash_grid_equals_its_plain_twin(num_features: int, threads: int) -> None:
+    grid = random_grid(
+        HashGridConfig(
+            num_levels=5, max_res=100, log2_table_size=12, features_per_level=num_features
+        )
+    )
+    points = (torch.rand(700, 3) * 1.2 - 0.1).requires_grad_()
+    with torch.no_grad():
+        points[:2] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    plain = grid(points)
+    upstream = torch.randn_like(plain)
+    plain_grads = torch.autograd.grad(plain, (points, grid.table), upstream)
+    grid.engine = "fast"
+    fast = grid(points)
+    fast_grads = torch.autograd.grad(fast, (points, grid.table), upstream)
+    assert (fast - plain).abs().max() < 2e-6
+    assert (fast_grads[1] - plain_grads[1]).abs().max() < 1e-5
+    assert plain_grads[0].abs().max() > 100.0  # slopes are per unit, cells are small
+    assert (fast_grads[0] - plain_grads[0]).abs().max() < 1e-3
+
+
+def test_hash_grid_gradient_repeats_to_the_bit(threads: int) -> None:
+    grid = random_grid(SMALL)
+    grid.engine = "fast"
+    points = torch.rand(5000, 3)
+
+    def gradient() -> torch.Tensor:
+        (found,) = torch.autograd.grad(grid(points).square().sum(), grid.table)
+        return found
+
+    assert torch.equal(gradient(), gradient())
+
+
+def test_hash_grid_survives_points_that_are_not_numbers() -> None:
+    grid = random_grid(SMALL)
+    grid.engine = "fast"
+    points = torch.tensor([[float("nan"), 0.5, 0.5], [float("inf"), -float("inf"), 0.5]])
+    assert torch.isfinite(grid(points)[1]).all()
+
+
+def test_hash_grid_refuses_a_table_it_cannot_read() -> None:
+    grid = random_grid(SMALL).double()
+    with pytest.raises(ValueError, match="float32"):
+        hash_encode_fast(torch.rand(4, 3), grid.table, grid.resolutions, grid.dense, grid.offsets)
+
+
+@pytest.mark.parametrize(("inputs", "outputs", "count"), [(7, 3, 5), (32, 64, TILE), (10, 16, 17)])
+def test_layer_equals_linear_and_relu(inputs: int, outputs: int, count: int) -> None:
+    torch.manual_seed(0)
+    linear = torch.nn.Linear(inputs, outputs)
+    packed = pack_layer(linear)
+    x = np.random.default_rng(0).normal(size=(inputs, TILE)).astype(np.float32)
+    out = np.zeros((len(packed.bias), TILE), np.float32)
+    expected = linear(torch.from_numpy(x.T)).detach().numpy().T[:, :count]
+    apply_layer(x, packed, count, False, False, out)
+    np.testing.assert_allclose(out[:outputs, :count], expected, atol=1e-5)
+    before = out.copy()
+    apply_layer(x, packed, count, False, True, out)  # adds the products, not the bias
+    products = expected - linear.bias.detach().numpy()[:, None]
+    np.testing.assert_allclose(
+        out[:outputs, :count], before[:outputs, :count] + products, atol=1e-5
+    )
+    apply_layer(x, packed, count, True, False, out)
+    np.testing.assert_allclose(out[:outputs, :count], expected.clip(0.0), atol=1e-5)
+
+
+def random_model(**changes: object) -> Nerfacto:
+    """A small model whose densities reach from fog to walls."""
+    torch.manual_seed(1)
+    settings: dict[str, object] = {
+        "num_proposal_samples": (24, 12),
+        "num_nerf_samples": 20,
+        "grid": SMALL,
+        "proposals": (ProposalConfig(grid=SMALL), ProposalConfig(grid=SMALL, hidden_dim=12)),
+        "appearance_dim": 6,
+        "far": 100.0,
+    }
+    model = Nerfacto(NerfactoConfig(**(settings | changes)), 4).eval()  # type: ignore[arg-type]
+    for module in model.modules():
+        if isinstance(module, HashGrid):
+            module.table.data.normal_()
+    with torch.no_grad():
+        for mlp in (model.field.density_mlp, *(network.mlp for network in model.proposals)):
+            mlp.layers[-1].weight[0] *= 3.0
+            mlp.layers[-1].bias[0] += 4.0
+    return model
+
+
+def random_rays(count: int = 101) -> Rays:
+    generator = torch.Generator().manual_seed(2)
+    directions = torch.randn(count, 3, generator=generator)
+    return Rays(
+        torch.rand(count, 3, generator=generator) - 0.5,
+        torch.nn.functional.normalize(directions, dim=-1),
+        torch.zeros(count, dtype=torch.int64),
+    )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"contraction": "l2", "background": "white"},
+        {"contraction": "none", "background": "black", "appearance_dim": 0},
+        {"hidden_dim": 19, "hidden_dim_color": 33, "geo_feature_dim": 5, "background": "random"},
+        {"share_proposal_network": True, "num_nerf_samples": 1},
+    ],
+    ids=str,
+)
+def test_rendered_rays_equal_the_plain_model(changes: dict[str, object], threads: int) -> None:
+    model, rays = random_model(**changes), random_rays()
+    with torch.no_grad():
+        plain = model(rays)
+    rgb, accumulation, median, expected = render_rays(
+        pack_model(model), rays.origins.numpy(), rays.directions.numpy()
+    )
+    assert plain["rgb"].std() > 0.02
+    np.testing.assert_allclose(rgb, plain["rgb"], atol=2e-5)
+    np.testing.assert_allclose(accumulation, plain["accumulation"], atol=2e-5)
+    np.testing.assert_allclose(expected, plain["expected_depth"], rtol=1e-3)
+    # A ray whose half-way weight falls on the edge of two samples may choose either.
+    same = np.isclose(median, plain["depth"].numpy(), rtol=1e-3)
+    assert same.mean() > 0.98
+
+
+def test_appearance_chooses_the_code_of_an_image() -> None:
+    model, rays = random_model(), random_rays()
+    with torch.no_grad():
+        plain = model(rays, appearance=2)["rgb"].numpy()
+    arrays = rays.origins.numpy(), rays.directions.numpy()
+    np.testing.assert_allclose(
+        render_rays(pack_model(model, appearance=2), *arrays)[0], plain, atol=2e-5
+    )
+    assert np.abs(render_rays(pack_model(model), *arrays)[0] - plain).max() > 1e-3
+
+
+@pytest.mark.parametrize("background", ["last_sample", "black", "white"])
+def test_leaving_work_out_changes_colours_by_less_than_stated(background: str) -> None:
+    model, rays = random_model(background=background), random_rays(400)
+    arrays = rays.origins.numpy(), rays.directions.numpy()
+    exact = render_rays(pack_model(model), *arrays)
+    early_stop, threshold = 1e-2, 2e-3
+    packed = pack_model(model, early_stop=early_stop, weight_threshold=threshold)
+    quick = render_rays(packed, *arrays)
+    bound = early_stop + model.config.num_nerf_samples * threshold
+    change = np.abs(quick[0] - exact[0]).max()
+    assert 0.0 < change < bound
+    assert 0.0 < np.abs(quick[1] - exact[1]).max() <= early_stop + 1e-6
+    np.testing.assert_array_equal(quick[2], exact[2])  # the median lies before any early stop
+
+
+def test_kernels_compile_into_the_folder_that_is_asked_for(tmp_path: Path) -> None:
+    code = (
+        "import numba; from pipelines.nerf.kernels.dense_layers import apply_layer, pack_layer, TILE;"
+        "import numpy as np, torch;"
+        "apply_layer(np.zeros((4, TILE), np.float32), pack_layer(torch.nn.Linear(4, 4)), 4, True,"
+        " False, np.zeros((4, TILE), np.float32))"
+    )
+    environment = {**os.environ, "NERFWORKS_HOME": str(tmp_path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=120)
+    assert list((tmp_path / "numba").glob("kernels-*/**/*.nbi"))
