@@ -10,6 +10,7 @@ import errno
 import logging
 import re
 import secrets
+import time
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from typing import Any
@@ -48,8 +49,12 @@ from storage.errors import (
 
 logger = logging.getLogger("nerfworks.api")
 
+access = logging.getLogger("nerfworks.access")
+
 PROBLEM_TYPE = "application/problem+json"
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_QUIET_PATHS = frozenset({"/livez", "/readyz"})
+_SECRET_PATH = re.compile(r"(/v1/objects/).*", re.DOTALL)
 _CAPTURE_STATUS = {"too_large": 413, "archive_bomb": 413, "unknown_type": 415}
 _FRAMEWORK_CODES = {404: "not_found", 405: "method_not_allowed", 413: "too_large"}
 _FRAMEWORK_HINTS = {
@@ -60,10 +65,12 @@ _FRAMEWORK_HINTS = {
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's `responses` for these error statuses, and for those that any call may give."""
+    """OpenAPI's `responses` for these error statuses, and for those that any call may give.
+
+    `api.app` adds the schema `Problem` that they refer to.
+    """
     return {
         status: {
-            "model": Problem,
             "content": {PROBLEM_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
             "description": HTTPStatus(status).phrase,
         }
@@ -180,9 +187,7 @@ def to_api_error(error: Exception) -> ApiError:
 async def _handle(request: Request, error: Exception) -> Response:
     answer = to_api_error(error)
     if answer.status >= 500:
-        logger.error(
-            "%s %r: %s", request.method, request.url.path, answer.code, exc_info=error
-        )
+        logger.error("%s %r: %s", request.method, request.url.path, answer.code, exc_info=error)
     return problem_response(request.url.path, answer)
 
 
@@ -203,14 +208,16 @@ class RequestGuard:
         given = dict(scope["headers"]).get(b"x-request-id", b"").decode("latin-1")
         request_id = given if _REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
         started = False
+        status = 0
+        began = time.monotonic()
 
         async def send_with_id(message: Message) -> None:
-            nonlocal started
+            nonlocal started, status
             if message["type"] == "http.response.start":
                 started = True
-                message.setdefault("headers", [])
+                status = message["status"]
                 message["headers"] = [
-                    *message["headers"],
+                    *message.get("headers", []),
                     (b"x-request-id", request_id.encode()),
                     (b"x-content-type-options", b"nosniff"),
                 ]
@@ -224,6 +231,11 @@ class RequestGuard:
             logger.exception("request %s: %s %r", request_id, scope["method"], scope["path"])
             answer = problem_response(scope["path"], to_api_error(error))
             await answer(scope, receive, send_with_id)
+        finally:
+            if scope["path"] not in _QUIET_PATHS:
+                seconds = time.monotonic() - began
+                path = _SECRET_PATH.sub(r"\1...", scope["path"])
+                access.info("%s %s %r %d %.3f", request_id, scope["method"], path, status, seconds)
 
 
 class BodyLimit:

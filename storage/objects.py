@@ -32,8 +32,7 @@ from storage.errors import (
 from storage.settings import StorageSettings
 
 CHUNK_BYTES = 1 << 20
-_TEMPORARY = ".tmp"
-_SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_./ ()+,=@%~")
+_TEMPORARY = ".nerfworks-tmp"
 
 OnBytes = Callable[[int], None]
 """Called with the number of bytes just moved. What it raises ends the transfer."""
@@ -94,7 +93,8 @@ class ObjectStore(Protocol):
 def check_key(key: str) -> str:
     """The key, if it is a plain relative path. Raises ValueError."""
     parts = key.split("/")
-    if not key or not set(key) <= _SAFE or any(part in ("", ".", "..") for part in parts):
+    plain = "\\" not in key and all(char.isprintable() for char in key)
+    if not plain or any(part in ("", ".", "..") for part in parts):
         raise ValueError(f"not an object key: {key!r}")
     return key
 

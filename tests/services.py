@@ -1,7 +1,7 @@
 """Real servers for tests, from wheels: Redis, PostgreSQL, S3. No mocks.
 
-`tests/conftest.py` offers the fixtures to every test. Where a wheel is missing the test skips aloud,
-unless CI is set: there it fails.
+`tests/conftest.py` offers the fixtures to every test. Where a wheel is missing the test skips
+aloud, unless CI is set: there it fails.
 """
 
 from __future__ import annotations

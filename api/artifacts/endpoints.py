@@ -44,9 +44,7 @@ def list_artifacts(job_id: str, services: ServicesDep, request: Request) -> Arti
         307: {"description": "The bytes are at this signed URL."},
     },
 )
-def download_artifact(
-    job_id: str, name: str, services: ServicesDep, request: Request
-) -> Response:
+def download_artifact(job_id: str, name: str, services: ServicesDep, request: Request) -> Response:
     """The bytes (`Range`, `ETag`), or a redirect to a signed URL of the object store."""
     with services.database.read_scope() as session:
         found = service.find(queries.get_job(session, job_id, manifests=True), name)

@@ -55,9 +55,7 @@ def find(job: Job, name: str) -> Published:
         if name in known
         else f"A finished job has {', '.join(known)}."
     )
-    raise MissingError(
-        f"Job {job.id} has no such artifact.", code="artifact_not_found", hint=hint
-    )
+    raise MissingError(f"Job {job.id} has no such artifact.", code="artifact_not_found", hint=hint)
 
 
 def signed_url(services: Services, found: Published, request: Request) -> str:

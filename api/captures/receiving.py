@@ -22,7 +22,6 @@ from typing import BinaryIO
 from python_multipart import MultipartParser
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import parse_options_header
-
 from starlette.requests import ClientDisconnect
 from starlette.types import Receive
 
@@ -268,7 +267,8 @@ async def receive(
 ) -> Received:
     """Read an upload to its end into the staging file.
 
-    Raises ApiError for what the service does not take, ClientDisconnect where the client goes away. The caller removes the file (`staging_file` does).
+    Raises ApiError for what the service does not take, ClientDisconnect where the client goes
+    away. The caller removes the file (`staging_file` does).
     """
     path, file = staging
     part = _FilePart(limits)

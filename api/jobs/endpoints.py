@@ -67,9 +67,7 @@ def list_jobs(
 
 
 @router.get("/{job_id}", responses=responses(404))
-def get_job(
-    job_id: str, services: ServicesDep, request: Request, response: Response
-) -> JobView:
+def get_job(job_id: str, services: ServicesDep, request: Request, response: Response) -> JobView:
     """One job: state, stages with progress and time left, metrics, error, artifacts."""
     with services.database.read_scope() as session:
         job = service.view(services, session, job_id, request)
@@ -78,9 +76,7 @@ def get_job(
 
 
 @router.post("/{job_id}/cancel", status_code=202, responses=responses(404, 409))
-def cancel_job(
-    job_id: str, services: ServicesDep, request: Request, response: Response
-) -> JobView:
+def cancel_job(job_id: str, services: ServicesDep, request: Request, response: Response) -> JobView:
     """Ask a job to stop; asking twice changes nothing. The running stage stops within 10 s."""
     service.cancel(services, job_id)
     with services.database.read_scope() as session:

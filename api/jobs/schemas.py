@@ -18,9 +18,7 @@ _LABEL_KEY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._/-]{0,62}")
 _METRICS = ("psnr", "ssim", "lpips", "num_images", "width", "height")
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
-StageState = Literal[
-    "blocked", "ready", "running", "succeeded", "failed", "cancelled", "skipped"
-]
+StageState = Literal["blocked", "ready", "running", "succeeded", "failed", "cancelled", "skipped"]
 StageName = StrEnum("StageName", {name: name for name in STAGE_NAMES})  # type: ignore[misc]
 
 

@@ -141,6 +141,7 @@ def _details(info: VideoInfo, packets: Scan) -> dict[str, object]:
         "rotation_deg": info.rotation_deg,
         "hdr": info.hdr,
         "variable_frame_rate": variable,
+        "start_s": round(packets.times_s[0], 6),
     }
 
 

@@ -83,12 +83,14 @@ class ProgressScale:
     fraction: float = 0.0
     goal: float = 1.0
     anchor: tuple[float, float] = field(default_factory=lambda: (time.monotonic(), 0.0))
+    expected_end: float | None = None
 
     def aim(self, start: float, goal: float) -> None:
         """From now on, time left is counted to `goal`, at the speed since now."""
         self.fraction = max(self.fraction, start)
         self.anchor = (time.monotonic(), self.fraction)
         self.goal = goal
+        self.expected_end = None
 
     def watch(self, span: Span, total: int, message: str) -> Watch:
         """A watch that maps 0..total onto `span`."""
@@ -96,12 +98,14 @@ class ProgressScale:
 
         def report(done: int) -> None:
             done = min(done, total)
-            self.fraction = max(self.fraction, start + (end - start) * done / max(total, 1))
+            fraction = start + (end - start) * done / max(total, 1)
             began, first = self.anchor
-            moved = self.fraction - first
-            left: float | None = None
-            if moved > 0.02 * (self.goal - first):
-                left = (time.monotonic() - began) / moved * max(self.goal - self.fraction, 0.0)
+            now = time.monotonic()
+            if fraction > self.fraction:
+                self.fraction = fraction
+                pace = (now - began) / (fraction - first)
+                self.expected_end = now + pace * max(self.goal - fraction, 0.0)
+            left = None if self.expected_end is None else max(self.expected_end - now, 0.0)
             self.ctx.progress(self.fraction, f"{message} {done} of {total}", left)
 
         return report

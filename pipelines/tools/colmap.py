@@ -2,15 +2,21 @@
 
 A `Reconstructor` owns one database. Images enter under names that are their index ("000012.jpg"),
 so that no name in a capture can upset a pair list. pycolmap blocks for minutes: each call runs in
-a thread while the calling thread counts rows in the database, reports them through a `Watch`, and
-ends the call by its cancellation token where the watch raises. Learned features are not offered:
-the wheel aborts the process when asked for them. Run this in a process that may die.
+a thread while the calling thread reports what is done through a `Watch`, and ends the call by its
+cancellation token where the watch raises. Learned features are not offered: the wheel aborts the
+process when asked for them. Run this in a process that may die.
+
+While pycolmap has the database open, nothing else in the process may: Python's sqlite3 is a second
+copy of SQLite, and two copies break each other's file locks (the process ends with SIGBUS; see
+"Multiple copies of SQLite linked into the same application" at sqlite.org/howtocorrupt.html).
+So images and pairs are given to pycolmap in portions, and done portions are counted.
 
 Axes here are COLMAP's: cameras look along +Z, +Y down. Pixel centres lie at (0.5, 0.5), as ours.
 """
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterable, Sequence
@@ -30,10 +36,10 @@ Watch = Callable[[int], None]
 """Called every half second with the number of items done; what it raises ends the call."""
 
 _POLL_S = 0.5
-_COUNT_FEATURES = "SELECT COUNT(*) FROM keypoints"
-_COUNT_PAIRS = "SELECT COUNT(*) FROM two_view_geometries"
-_PAIR_BLOCK = 40
-"""Pairs written to the database at once: small, so that progress is seen."""
+_IMAGE_PORTION = 16
+_PAIR_TILE = 12
+"""Pairs are taken in tiles of 12 x 12 images, whose features then stay in memory."""
+_PAIR_PORTION = 144
 _ANGLE_SAMPLE = 3000
 
 LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
@@ -177,39 +183,57 @@ class Reconstructor:
         options.max_image_size = max_image_px
         options.num_threads = self.num_threads
         options.sift.max_num_features = num_features
+        done = 0
         for group in groups:
-            self._extract_group(group, options, watch)
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = group.lens
+            for first in range(0, len(group.indices), _IMAGE_PORTION):
+                portion = group.indices[first : first + _IMAGE_PORTION]
+                names = [self.names[index] for index in portion]
+                self._extract_portion(names, reader, options, watch, done)
+                done += len(portion)
+                if first == 0 and done < len(self.names):
+                    reader.existing_camera_id = self._camera_of(names[0])
+        watch(done)
 
-    def _extract_group(self, group: CameraGroup, options: Any, watch: Watch) -> None:
-        """Features of images that share one camera, which is made new."""
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = group.lens
+    def _extract_portion(
+        self, names: list[str], reader: Any, options: Any, watch: Watch, done: int
+    ) -> None:
+        """Features of a few images that share the reader's camera."""
         self._run(
             "finding features",
             lambda token: pycolmap.extract_features(
                 self.database,
                 self.links,
-                image_names=[self.names[index] for index in group.indices],
+                image_names=names,
                 camera_mode=pycolmap.CameraMode.SINGLE,
                 reader_options=reader,
                 extraction_options=options,
                 cancellation_token=token,
             ),
-            lambda: watch(self._count(_COUNT_FEATURES)),
+            lambda: watch(done),
         )
 
     def match(self, pairs: Iterable[tuple[int, int]], watch: Watch) -> None:
         """Match and verify pairs of indices; those already in the database are not done again.
 
-        watch: receives the number of all pairs in the database.
+        watch: receives the number of these pairs that are done.
         """
+        ordered = sorted(
+            pairs, key=lambda pair: (pair[0] // _PAIR_TILE, pair[1] // _PAIR_TILE, pair)
+        )
+        for first in range(0, len(ordered), _PAIR_PORTION):
+            self._match_portion(ordered[first : first + _PAIR_PORTION], watch, first)
+        watch(len(ordered))
+
+    def _match_portion(self, pairs: list[tuple[int, int]], watch: Watch, done: int) -> None:
+        """Match and verify a few pairs."""
         listed = self.scratch / "pairs.txt"
         listed.write_text("".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs), "utf-8")
         matching = pycolmap.FeatureMatchingOptions()
         matching.num_threads = self.num_threads
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = listed
-        pairing.block_size = _PAIR_BLOCK
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = self.seed
         self._run(
@@ -221,7 +245,7 @@ class Reconstructor:
                 verification_options=verification,
                 cancellation_token=token,
             ),
-            lambda: watch(self._count(_COUNT_PAIRS)),
+            lambda: watch(done),
         )
 
     def map(self, settings: MapperSettings, watch: Watch) -> list[SparseModel]:
@@ -253,10 +277,10 @@ class Reconstructor:
         return [sparse_model(model) for model in found.values() if model.num_reg_images() > 1]
 
     def statistics(self) -> PairStatistics:
-        """What extraction and matching put into the database."""
+        """What extraction and matching put into the database. Not while another call runs."""
         num_features = np.zeros(len(self.names), np.int64)
         best = np.zeros(len(self.names), np.int64)
-        with sqlite3.connect(self.database) as connection:
+        with contextlib.closing(sqlite3.connect(self.database)) as connection:
             index_of = {
                 image_id: image_index(name)
                 for image_id, name in connection.execute("SELECT image_id, name FROM images")
@@ -266,7 +290,6 @@ class Reconstructor:
             pairs = connection.execute(
                 "SELECT pair_id, rows, config FROM two_view_geometries"
             ).fetchall()
-        connection.close()
         verified = [pair for pair in pairs if pair[1] > 0]
         for pair_id, rows, _ in verified:
             for image_id in pycolmap.pair_id_to_image_pair(pair_id):
@@ -296,18 +319,11 @@ class Reconstructor:
             options.mapper.abs_pose_min_inlier_ratio = 0.15
         return options
 
-    def _count(self, query: str) -> int:
-        """Rows in the database; 0 while it is being made or is locked."""
-        try:
-            connection = sqlite3.connect(f"file:{self.database}?mode=ro", uri=True, timeout=0.2)
-        except sqlite3.OperationalError:
-            return 0
-        try:
-            return int(connection.execute(query).fetchone()[0])
-        except sqlite3.OperationalError:
-            return 0
-        finally:
-            connection.close()
+    def _camera_of(self, name: str) -> int:
+        """COLMAP's id of the camera of an image in the database; -1 where it was not readable."""
+        with pycolmap.Database.open(self.database) as database:
+            image = database.read_image_with_name(name)
+            return -1 if image is None else int(image.camera_id)
 
     def _run(
         self,

@@ -8,6 +8,7 @@ is orphaned in a session of its own.
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import threading
@@ -17,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TypeVar
+from typing import IO
 
 from pipelines.errors import Cancelled, ToolError
 
@@ -35,7 +36,6 @@ _SIGNAL_ADVICE: Mapping[int, str] = {
     signal.SIGABRT: "The program has a fault: try the input converted to another format.",
 }
 _NO_LIMIT = float("inf")
-_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,11 @@ class Program:
     """A running program, as a context: whatever happens inside, it is gone afterwards.
 
     argv: the program and its arguments, never a shell string.
-    on_line: called with each stderr line. on_stdout: called with each chunk of stdout; without it
-    stdout is dropped. Both are called in threads of their own; what they raise, `wait` raises.
-    stdin: whether `write` will be used.
+    on_line: called with each stderr line, in a thread of its own; what it raises, `wait` raises.
+    on_stdout: called with each chunk of stdout, in the caller's thread, by `wait`; without it
+    stdout is dropped.
+    stdin: whether `write` will be used; then not together with on_stdout, since each would wait
+    for the other.
     is_cancelled: polled in `write` and `wait`; once true the program is killed.
     advice: what to do about exit codes of this program.
     Raises ToolError where the program cannot be started.
@@ -90,10 +92,12 @@ class Program:
         self._is_cancelled = is_cancelled
         self._on_line = on_line
         self._on_stdout = on_stdout
+        if stdin and on_stdout:
+            raise ValueError("stdin and on_stdout cannot be used together")
         self._wants_stdin = stdin
         self._advice = dict(advice or {})
         self._log: deque[str] = deque(maxlen=LOG_LINES)
-        self._callback_errors: list[Exception] = []
+        self._callback_error: Exception | None = None
         self._timed_out = threading.Event()
 
     def __enter__(self) -> Program:
@@ -111,11 +115,8 @@ class Program:
                 hint=f"Install {self._name}, or repair its installation.",
             ) from error
         self._started = time.monotonic()
-        self._threads = [threading.Thread(target=self._read_log, daemon=True)]
-        if self._on_stdout:
-            self._threads.append(threading.Thread(target=self._read_stdout, daemon=True))
-        for thread in self._threads:
-            thread.start()
+        self._log_thread = threading.Thread(target=self._read_log, daemon=True)
+        self._log_thread.start()
         self._timer: threading.Timer | None = None
         if self._time_limit_s != _NO_LIMIT:
             self._timer = threading.Timer(self._time_limit_s, self._on_time_limit)
@@ -132,8 +133,7 @@ class Program:
         self._kill()
         if self._timer:
             self._timer.cancel()
-        for thread in self._threads:
-            thread.join()
+        self._log_thread.join()
         for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             if pipe:
                 _close_quietly(pipe)
@@ -159,16 +159,16 @@ class Program:
         """
         if self._process.stdin:
             _close_quietly(self._process.stdin)
+        self._drain_stdout()
         while True:
             try:
                 returncode = self._process.wait(_POLL_S)
                 break
             except subprocess.TimeoutExpired:
                 self._check_cancelled()
-        for thread in self._threads:
-            thread.join()
-        if self._callback_errors:
-            raise self._callback_errors[0]
+        self._log_thread.join()
+        if self._callback_error is not None:
+            raise self._callback_error
         self._raise_for(returncode)
         return ProgramResult(tuple(self._log), time.monotonic() - self._started)
 
@@ -207,29 +207,34 @@ class Program:
 
     def _read_log(self) -> None:
         assert self._process.stderr is not None
-        # Programs redraw a progress line with \r: iterating in universal newlines splits there.
+        # Programs redraw a progress line with \r: universal newlines split there too.
         with open(
             self._process.stderr.fileno(), encoding="utf-8", errors="replace", closefd=False
         ) as lines:
             for line in lines:
-                self._log.append(line.rstrip("\n"))
-                self._call(self._on_line, line.rstrip("\n"))
+                text = line.rstrip("\n")
+                self._log.append(text)
+                if self._on_line is None or self._callback_error is not None:
+                    continue
+                try:
+                    self._on_line(text)
+                except Exception as error:  # noqa: BLE001  carried to the caller's thread
+                    self._callback_error = error
+                    self._process.kill()
 
-    def _read_stdout(self) -> None:
-        assert self._process.stdout is not None
-        descriptor = self._process.stdout.fileno()
-        while chunk := os.read(descriptor, _CHUNK_BYTES):
-            self._call(self._on_stdout, chunk)
-
-    def _call(self, callback: Callable[[_Value], None] | None, value: _Value) -> None:
-        """Call back; after a first failure the program is ended and the rest only drained."""
-        if callback is None or self._callback_errors:
+    def _drain_stdout(self) -> None:
+        """Hand stdout on until it ends, noticing a cancel within `_POLL_S` or a chunk's work."""
+        if self._on_stdout is None or self._process.stdout is None:
             return
-        try:
-            callback(value)
-        except Exception as error:  # noqa: BLE001  carried to the caller's thread, raised there
-            self._callback_errors.append(error)
-            self._process.kill()
+        descriptor = self._process.stdout.fileno()
+        while True:
+            self._check_cancelled()
+            if not select.select([descriptor], [], [], _POLL_S)[0]:
+                continue
+            chunk = os.read(descriptor, _CHUNK_BYTES)
+            if not chunk:
+                return
+            self._on_stdout(chunk)
 
 
 def _close_quietly(pipe: IO[bytes]) -> None:

@@ -12,23 +12,22 @@ from api.client import Client
 from deploy.embedded import Embedded, free_port
 from tests.capture_writers import write_polycam
 from tests.samples import SMALL
-from tests.services import S3Server
+from tests.services import RedisServer, S3Endpoint
 
 pytestmark = [pytest.mark.services, pytest.mark.slow]
 
 
 def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
     postgres_url: str,
-    s3_server: S3Server,
-    redis_url: str,
+    s3_endpoint: S3Endpoint,
+    redis_server: RedisServer,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name, value in {
         "NERFWORKS_DATABASE_URL": postgres_url,
-        "NERFWORKS_REDIS_URL": redis_url,
-        "NERFWORKS_OBJECTS_URL": f"s3://{s3_server.bucket}/e2e",
-        **s3_server.environment(),
+        "NERFWORKS_REDIS_URL": redis_server.url,
+        **s3_endpoint.environment(),
     }.items():
         monkeypatch.setenv(name, value)
     archive = tmp_path / "polycam.zip"
@@ -58,4 +57,5 @@ def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
     report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
     assert report["capture"]["kind"] == "polycam"
     assert report["metrics"]["psnr"] >= 20.0
-    assert s3_server.keys() == [], "bytes are left after the deletes"
+    left = [path for path in s3_endpoint.folder.rglob("*") if path.is_file()]
+    assert not left, f"bytes are left after the deletes: {left}"

@@ -71,7 +71,7 @@ def test_penalty_is_the_weighted_mean_length() -> None:
     optimizer = CameraOptimizer(2, "so3xr3", translation_penalty=2.0, rotation_penalty=3.0)
     with torch.no_grad():
         optimizer.tangent[0] = torch.tensor([3.0, 4.0, 0.0, 0.0, 0.0, 2.0])
-    assert abs(float(optimizer.penalty()) - (2.0 * 5.0 / 2 + 3.0 * 2.0 / 2)) < 1e-6
+    assert abs(float(optimizer.penalty().detach()) - (2.0 * 5.0 / 2 + 3.0 * 2.0 / 2)) < 1e-6
     optimizer.penalty().backward()
     assert optimizer.tangent.grad is not None
     assert bool(optimizer.tangent.grad.isfinite().all())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,11 @@ SMALL = HashGridConfig(num_levels=5, max_res=100, log2_table_size=12)
 
 
 @pytest.fixture(params=[1, 2], ids=["one thread", "two threads"])
-def threads(request: pytest.FixtureRequest) -> int:
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
-    request.addfinalizer(lambda: torch.set_num_threads(before))
-    return int(request.param)
+    yield request.param
+    torch.set_num_threads(before)
 
 
 def random_grid(config: HashGridConfig) -> HashGrid:
@@ -121,8 +122,9 @@ def random_model(**changes: object) -> Nerfacto:
             module.table.data.normal_()
     with torch.no_grad():
         for mlp in (model.field.density_mlp, *(network.mlp for network in model.proposals)):
-            mlp.layers[-1].weight[0] *= 3.0
+            mlp.layers[-1].weight[0] *= 8.0
             mlp.layers[-1].bias[0] += 4.0
+        model.field.color_mlp.layers[-1].weight *= 8.0
     return model
 
 
@@ -134,6 +136,13 @@ def random_rays(count: int = 101) -> Rays:
         torch.nn.functional.normalize(directions, dim=-1),
         torch.zeros(count, dtype=torch.int64),
     )
+
+
+def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
+    """Equal to rounding: in a field of noise a few rays amplify it, since their samples move."""
+    error = np.abs(found - expected)
+    assert error.mean() < 5e-5
+    assert error.max() < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -155,8 +164,8 @@ def test_rendered_rays_equal_the_plain_model(changes: dict[str, object], threads
         pack_model(model), rays.origins.numpy(), rays.directions.numpy()
     )
     assert plain["rgb"].std() > 0.02
-    np.testing.assert_allclose(rgb, plain["rgb"], atol=2e-5)
-    np.testing.assert_allclose(accumulation, plain["accumulation"], atol=2e-5)
+    assert_close(rgb, plain["rgb"].numpy())
+    assert_close(accumulation, plain["accumulation"].numpy())
     np.testing.assert_allclose(expected, plain["expected_depth"], rtol=1e-3)
     # A ray whose half-way weight falls on the edge of two samples may choose either.
     same = np.isclose(median, plain["depth"].numpy(), rtol=1e-3)
@@ -168,15 +177,15 @@ def test_appearance_chooses_the_code_of_an_image() -> None:
     with torch.no_grad():
         plain = model(rays, appearance=2)["rgb"].numpy()
     arrays = rays.origins.numpy(), rays.directions.numpy()
-    np.testing.assert_allclose(
-        render_rays(pack_model(model, appearance=2), *arrays)[0], plain, atol=2e-5
-    )
+    assert_close(render_rays(pack_model(model, appearance=2), *arrays)[0], plain)
     assert np.abs(render_rays(pack_model(model), *arrays)[0] - plain).max() > 1e-3
 
 
 @pytest.mark.parametrize("background", ["last_sample", "black", "white"])
 def test_leaving_work_out_changes_colours_by_less_than_stated(background: str) -> None:
     model, rays = random_model(background=background), random_rays(400)
+    with torch.no_grad():
+        model.field.density_mlp.layers[-1].bias[0] += 3.0
     arrays = rays.origins.numpy(), rays.directions.numpy()
     exact = render_rays(pack_model(model), *arrays)
     early_stop, threshold = 1e-2, 2e-3
@@ -191,7 +200,7 @@ def test_leaving_work_out_changes_colours_by_less_than_stated(background: str) -
 
 def test_kernels_compile_into_the_folder_that_is_asked_for(tmp_path: Path) -> None:
     code = (
-        "import numba; from pipelines.nerf.kernels.dense_layers import apply_layer, pack_layer, TILE;"
+        "from pipelines.nerf.kernels.dense_layers import apply_layer, pack_layer, TILE;"
         "import numpy as np, torch;"
         "apply_layer(np.zeros((4, TILE), np.float32), pack_layer(torch.nn.Linear(4, 4)), 4, True,"
         " False, np.zeros((4, TILE), np.float32))"

@@ -11,7 +11,7 @@ from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.renderer import RenderedImage, Renderer
 
-from .test_kernels import random_model
+from .test_kernels import assert_close, random_model
 
 SCENE = SceneTransform(center=(1.0, 2.0, 3.0), scale=0.25)
 
@@ -33,10 +33,10 @@ def two_cameras(width: int = 23, height: int = 17) -> Cameras:
     )
 
 
-def assert_same(one: RenderedImage, other: RenderedImage, tolerance: float = 2e-5) -> None:
-    np.testing.assert_allclose(one.rgb, other.rgb, atol=tolerance)
-    np.testing.assert_allclose(one.accumulation, other.accumulation, atol=tolerance)
-    np.testing.assert_allclose(one.expected_depth, other.expected_depth, rtol=1e-3)
+def assert_same(one: RenderedImage, other: RenderedImage) -> None:
+    assert_close(one.rgb, other.rgb)
+    assert_close(one.accumulation, other.accumulation)
+    np.testing.assert_allclose(one.expected_depth, other.expected_depth, rtol=2e-3)
     assert np.isclose(one.depth, other.depth, rtol=1e-3).mean() > 0.98
 
 
@@ -79,7 +79,7 @@ def test_tiles_do_not_show(engine: str, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(renderer_module, "FAST_TILE_RAYS", 50)
     monkeypatch.setattr(renderer_module, "MAX_PLAIN_RAYS", 50)
     shares: list[float] = []
-    assert_same(renderer.render(two_cameras(), 0, progress=shares.append), whole, 1e-6)
+    assert_same(renderer.render(two_cameras(), 0, progress=shares.append), whole)
     assert len(shares) == 8
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
@@ -120,6 +120,6 @@ def test_a_model_on_a_gpu_shows_the_same_picture() -> None:
     cameras = two_cameras()
     on_cpu = Renderer(random_model(), SCENE, engine="plain").render(cameras, 1)
     on_gpu = Renderer(random_model(), SCENE, device="cuda").render(cameras, 1)
-    assert_same(on_cpu, on_gpu, tolerance=1e-3)
+    assert_same(on_cpu, on_gpu)
     with pytest.raises(NerfError, match="runs on the CPU"):
         Renderer(random_model(), SCENE, engine="fast", device="cuda")

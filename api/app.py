@@ -1,0 +1,105 @@
+"""The application: routers, what they share, and how errors look."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from fastapi import Depends, FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
+from starlette.concurrency import run_in_threadpool
+
+from api import catalogue, errors, health
+from api.artifacts import endpoints as artifacts
+from api.captures import endpoints as captures
+from api.captures.receiving import sweep
+from api.deps import Services, require_key
+from api.jobs import endpoints as jobs
+from api.problems import Problem
+from api.settings import ApiSettings
+from storage.api_keys import ensure_api_key
+from storage.db import Database
+from storage.migrations import upgrade
+from storage.objects import open_object_store
+from storage.queue import Bell
+
+VERSION = "1"
+logger = logging.getLogger("nerfworks.api")
+
+
+def open_services(settings: ApiSettings) -> Services:
+    """Open the parts: bring the database up to date, make the first key valid, tidy up."""
+    upgrade(settings.resolved_database_url)
+    database = Database(settings.resolved_database_url)
+    key = settings.bootstrap_key()
+    if key:
+        with database.session_scope() as session:
+            ensure_api_key(session, key, "bootstrap")
+    settings.staging_dir.mkdir(parents=True, exist_ok=True)
+    removed = sweep(settings.staging_dir)
+    if removed:
+        logger.info("removed %d uploads that were cut short", removed)
+    store = open_object_store(settings)
+    return Services(settings, database, store, Bell(settings.redis_url))
+
+
+def close_services(services: Services) -> None:
+    """Close what `open_services` opened."""
+    services.bell.close()
+    services.database.dispose()
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    services = await run_in_threadpool(open_services, app.state.settings)
+    app.state.services = services
+    try:
+        yield
+    finally:
+        await run_in_threadpool(close_services, services)
+
+
+def _operation_id(route: APIRoute) -> str:
+    return route.name
+
+
+def _document(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document, with the error schema that all responses refer to."""
+    if app.openapi_schema is None:
+        document = get_openapi(
+            title=app.title, version=app.version, description=app.description, routes=app.routes
+        )
+        schema = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas = document["components"]["schemas"]
+        schemas.update(schema.pop("$defs", {}))
+        schemas["Problem"] = schema
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+def create_app(settings: ApiSettings | None = None) -> FastAPI:
+    """The ASGI application. Settings come from the environment where none are given."""
+    settings = settings or ApiSettings()
+    app = FastAPI(
+        title="nerfworks",
+        version=VERSION,
+        description=(
+            "Send a phone capture over HTTP; get back a mesh, a point cloud and a video. Errors "
+            "are RFC 9457 problem documents with a stable `code` and a `hint`."
+        ),
+        lifespan=_lifespan,
+        generate_unique_id_function=_operation_id,
+        redirect_slashes=False,
+    )
+    app.state.settings = settings
+    errors.install(app, max_body_bytes=settings.max_body_bytes, upload_path=captures.PATH)
+    keyed = [Depends(require_key)]
+    for router in (captures.router, jobs.router, artifacts.router, catalogue.router):
+        app.include_router(router, dependencies=keyed)
+    for router in (artifacts.signed_router, health.router, catalogue.page_router):
+        app.include_router(router)
+    app.openapi = lambda: _document(app)  # type: ignore[method-assign]
+    return app

@@ -1,0 +1,319 @@
+"""The typed Python client: `from nerfworks import Client`.
+
+    with Client() as client:
+        capture = client.upload("walk.mp4")
+        job = client.wait(client.create_job(capture.id).id)
+        client.download(job.id, "out")
+
+It rides out a service that restarts: calls that may be repeated are, with growing pauses, for up to
+`retry_s` seconds. Needs httpx and pydantic, and nothing of the server.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import httpx
+
+from api.client_models import (
+    ApiProblem,
+    Artifact,
+    Capture,
+    ChecksumMismatch,
+    ConnectionFailed,
+    Job,
+    JobError,
+    JobFailed,
+    LogPage,
+    NerfworksError,
+    Preset,
+    Presets,
+    Stage,
+    WaitTimedOut,
+)
+from api.client_transfer import Download, MultipartFile, OnProgress
+from api.client_wire import (
+    BUSY,
+    Patience,
+    Wire,
+    checked,
+    find_service,
+    poll_pause,
+    problem_of,
+    segment,
+)
+
+__all__ = [
+    "ApiProblem",
+    "Artifact",
+    "Capture",
+    "ChecksumMismatch",
+    "Client",
+    "ConnectionFailed",
+    "Job",
+    "JobError",
+    "JobFailed",
+    "NerfworksError",
+    "Preset",
+    "Presets",
+    "Stage",
+    "WaitTimedOut",
+    "find_service",
+]
+
+RETRY_S = 60.0
+UPLOAD_TIMEOUT = httpx.Timeout(60.0, connect=5.0, read=600.0)
+
+
+class Client:
+    """A connection to one service. Use it as a context manager, from one thread at a time."""
+
+    def __init__(
+        self, url: str | None = None, api_key: str | None = None, *, retry_s: float = RETRY_S
+    ) -> None:
+        """retry_s: how long calls that may be repeated ride out a service that is away."""
+        self.url, key = find_service(url, api_key)
+        self._wire = Wire(self.url, key, retry_s)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._wire.http.close()
+
+    # Captures
+
+    def upload(self, path: str | Path, progress: OnProgress | None = None) -> Capture:
+        """Send a capture. An upload that breaks off is sent again from its start.
+
+        Raises NerfworksError for a file that cannot be read, ApiProblem where it is refused.
+        """
+        path = Path(path)
+        try:
+            with path.open("rb") as file:
+                body = MultipartFile(file, path.name, os.fstat(file.fileno()).st_size)
+
+                def send() -> httpx.Response:
+                    return self._wire.http.post(
+                        "/v1/captures",
+                        content=body.chunks(progress),
+                        headers=body.headers,
+                        timeout=UPLOAD_TIMEOUT,
+                    )
+
+                return Capture.model_validate(checked(self._wire.send(send)).json())
+        except OSError as error:
+            raise NerfworksError(f"{path} cannot be read: {error.strerror}.") from error
+
+    def get_capture(self, capture_id: str) -> Capture:
+        """One capture."""
+        return Capture.model_validate(self._get(f"/v1/captures/{segment(capture_id)}"))
+
+    def captures(self) -> Iterator[Capture]:
+        """All captures, newest first."""
+        return (Capture.model_validate(item) for item in self._items("/v1/captures", {}))
+
+    def delete_capture(self, capture_id: str) -> None:
+        """Delete a capture and its bytes."""
+        self._delete(f"/v1/captures/{segment(capture_id)}")
+
+    # Jobs
+
+    def create_job(
+        self,
+        capture_id: str,
+        preset: str | None = None,
+        options: dict[str, Any] | None = None,
+        labels: dict[str, str] | None = None,
+    ) -> Job:
+        """Start a job. Repeated only where the request cannot have arrived."""
+        wanted: dict[str, Any] = {"capture_id": capture_id}
+        wanted |= {"preset": preset} if preset else {}
+        wanted |= {"options": options or {}, "labels": labels or {}}
+        answer = self._wire.send(
+            lambda: self._wire.http.post("/v1/jobs", json=wanted), once_only=True
+        )
+        return Job.model_validate(checked(answer).json())
+
+    def get_job(self, job_id: str) -> Job:
+        """One job as it stands."""
+        return Job.model_validate(self._get(f"/v1/jobs/{segment(job_id)}"))
+
+    def jobs(self, state: str | None = None, label: str | None = None) -> Iterator[Job]:
+        """Jobs, newest first, page by page. label: KEY or KEY=VALUE."""
+        wanted = {"state": state, "label": label}
+        wanted = {key: value for key, value in wanted.items() if value is not None}
+        return (Job.model_validate(item) for item in self._items("/v1/jobs", wanted))
+
+    def wait(
+        self,
+        job_id: str,
+        on_update: Callable[[Job], None] | None = None,
+        timeout: float | None = None,
+        check: bool = False,
+    ) -> Job:
+        """Wait until a job is over; restarts of the service are ridden out.
+
+        on_update: called with the job each time it was looked at. check: raise JobFailed where it
+        did not succeed. Raises WaitTimedOut after `timeout` seconds.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            answer = checked(
+                self._wire.send(lambda: self._wire.http.get(f"/v1/jobs/{segment(job_id)}"))
+            )
+            job = Job.model_validate(answer.json())
+            if on_update is not None:
+                on_update(job)
+            if job.is_over:
+                if check and job.state != "succeeded":
+                    raise JobFailed(job)
+                return job
+            if deadline is not None and time.monotonic() >= deadline:
+                raise WaitTimedOut(job, timeout or 0.0)
+            pause = poll_pause(answer)
+            if deadline is not None:
+                pause = min(pause, max(deadline - time.monotonic(), 0.0))
+            time.sleep(pause)
+
+    def cancel(self, job_id: str) -> Job:
+        """Ask a job to stop."""
+        answer = self._wire.send(lambda: self._wire.http.post(f"/v1/jobs/{segment(job_id)}/cancel"))
+        return Job.model_validate(checked(answer).json())
+
+    def delete_job(self, job_id: str) -> None:
+        """Delete a job and its bytes."""
+        self._delete(f"/v1/jobs/{segment(job_id)}")
+
+    def log_page(self, job_id: str, stage: str | None = None, line: int = 0) -> LogPage:
+        """Some lines of a job's log from `line` on; negative: the tail."""
+        wanted: dict[str, Any] = {"line": line} | ({"stage": stage} if stage else {})
+        return LogPage.model_validate(self._get(f"/v1/jobs/{segment(job_id)}/logs", wanted))
+
+    def logs(self, job_id: str, stage: str | None = None, line: int = 0) -> list[str]:
+        """All lines of a job's log from `line` on; negative: the tail."""
+        lines: list[str] = []
+        while True:
+            page = self.log_page(job_id, stage, line)
+            lines += page.lines
+            line = page.next
+            if not page.lines or page.next >= page.total:
+                return lines
+
+    # Artifacts
+
+    def artifacts(self, job_id: str) -> list[Artifact]:
+        """What a job offers for download."""
+        found = self._get(f"/v1/jobs/{segment(job_id)}/artifacts")
+        return [Artifact.model_validate(item) for item in found["items"]]
+
+    def download(
+        self,
+        job_id: str,
+        folder: str | Path,
+        names: Iterable[str] | None = None,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> list[Path]:
+        """Download artifacts, all or those of these names, into a folder.
+
+        Goes on where an earlier download broke off; what is there already is not fetched again;
+        each file is verified and appears whole. progress: called with (name, bytes, of bytes).
+        Raises ChecksumMismatch, ApiProblem, ConnectionFailed; NerfworksError for an unknown name.
+        """
+        folder = Path(folder)
+        offered = {artifact.name: artifact for artifact in self.artifacts(job_id)}
+        wanted = list(offered) if names is None else list(names)
+        for name in wanted:
+            if name not in offered:
+                raise NerfworksError(
+                    f"Job {job_id} has no artifact {name}.", f"It has {', '.join(offered)}."
+                )
+        folder.mkdir(parents=True, exist_ok=True)
+        return [self._download(job_id, offered[name], folder, progress) for name in wanted]
+
+    def _download(
+        self,
+        job_id: str,
+        artifact: Artifact,
+        folder: Path,
+        progress: Callable[[str, int, int], None] | None,
+    ) -> Path:
+        def report(done: int, size: int) -> None:
+            if progress is not None:
+                progress(artifact.name, done, size)
+
+        download = Download(artifact, folder, report)
+        if download.is_done():
+            report(artifact.bytes, artifact.bytes)
+            return download.target
+        url = f"/v1/jobs/{segment(job_id)}/artifacts/{segment(artifact.name)}"
+        patience = Patience(self._wire.retry_s)
+        damaged = 0
+        while True:
+            before = download.bytes_here
+            try:
+                download.attempt(self._wire.http, url)
+                return download.target
+            except ChecksumMismatch:
+                damaged += 1
+                if damaged > 1 or not before:
+                    raise
+            except (httpx.TransportError, httpx.HTTPStatusError) as error:
+                if isinstance(error, httpx.HTTPStatusError):
+                    if error.response.status_code not in BUSY:
+                        raise problem_of(error.response) from error
+                elif download.bytes_here > before:
+                    patience = Patience(self._wire.retry_s)
+                patience.pause_or_raise(self.url, error)
+
+    # Catalogue
+
+    def presets(self) -> Presets:
+        """The presets, and which one a job gets that names none."""
+        return Presets.model_validate(self._get("/v1/presets"))
+
+    def options_schema(self) -> dict[str, Any]:
+        """JSON Schema of all options."""
+        schema: dict[str, Any] = self._get("/v1/options")
+        return schema
+
+    # The wire
+
+    def _get(self, path: str, params: dict[str, Any] | None = None) -> Any:
+        return self._wire.get(path, params).json()
+
+    def _items(self, path: str, params: dict[str, Any]) -> Iterator[Any]:
+        cursor: str | None = None
+        while True:
+            page = self._get(path, {**params, **({"cursor": cursor} if cursor else {})})
+            yield from page["items"]
+            cursor = page["next_cursor"]
+            if cursor is None:
+                return
+
+    def _delete(self, path: str) -> None:
+        tries = 0
+
+        def send() -> httpx.Response:
+            nonlocal tries
+            tries += 1
+            return self._wire.http.delete(path)
+
+        answer = self._wire.send(send)
+        if answer.status_code == 404 and tries > 1:
+            return  # an earlier try arrived, its answer did not
+        checked(answer)

@@ -1,0 +1,147 @@
+"""How the client reaches a service: where it is, what is tried again, what errors become."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import httpx
+
+from api.client_models import ApiProblem, ConnectionFailed
+
+POLL_MIN_S, POLL_MAX_S = 0.2, 30.0
+PAUSE_FIRST_S, PAUSE_MOST_S = 0.2, 5.0
+TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+BUSY = frozenset({502, 503, 504})
+_NEVER_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
+_START = "Start one with `make up`, or set NERFWORKS_URL and NERFWORKS_API_KEY."
+
+
+def find_service(url: str | None = None, api_key: str | None = None) -> tuple[str, str]:
+    """(URL, key): as given, else NERFWORKS_URL and NERFWORKS_API_KEY, else the service that runs
+    from this folder (service.json in NERFWORKS_HOME or .nerfworks).
+
+    The key of service.json is only sent to the URL of service.json. Raises ConnectionFailed where
+    no service is named.
+    """
+    url = url or os.environ.get("NERFWORKS_URL") or None
+    api_key = api_key or os.environ.get("NERFWORKS_API_KEY") or None
+    here: dict[str, Any] = {}
+    path = Path(os.environ.get("NERFWORKS_HOME", ".nerfworks")) / "service.json"
+    with suppress(OSError, json.JSONDecodeError):
+        here = json.loads(path.read_text("utf-8"))
+    url = url or here.get("url")
+    if url is None:
+        raise ConnectionFailed("No service runs from this folder.", _START)
+    url = url.rstrip("/")
+    if api_key is None and url == str(here.get("url", "")).rstrip("/"):
+        api_key = here.get("api_key")
+    return url, api_key or ""
+
+
+class Wire:
+    """One service's connections."""
+
+    def __init__(self, url: str, api_key: str, retry_s: float) -> None:
+        self.url = url
+        self.retry_s = retry_s
+        headers = {"Authorization": f"Bearer {api_key}"} if api_key else {}
+        try:
+            if httpx.URL(url).scheme not in ("http", "https") or not httpx.URL(url).host:
+                raise ValueError("no http or https address")
+            self.http = httpx.Client(base_url=url, headers=headers, timeout=TIMEOUT)
+        except (httpx.InvalidURL, ValueError) as error:
+            raise ConnectionFailed(f"{url!r} is no usable address.", _START) from error
+
+    def get(self, path: str, params: dict[str, Any] | None = None) -> httpx.Response:
+        """A successful GET. Raises ApiProblem, ConnectionFailed."""
+        return checked(self.send(lambda: self.http.get(path, params=params)))
+
+    def send(
+        self, request: Callable[[], httpx.Response], *, once_only: bool = False
+    ) -> httpx.Response:
+        """Send until there is an answer. once_only: not again where it may have arrived.
+
+        Raises ConnectionFailed after `retry_s` seconds without one.
+        """
+        patience = Patience(self.retry_s)
+        while True:
+            error: httpx.TransportError | None = None
+            try:
+                answer = request()
+                if answer.status_code not in BUSY or patience.is_over:
+                    return answer
+            except httpx.TransportError as failure:
+                if once_only and not isinstance(failure, _NEVER_SENT):
+                    raise unreachable(self.url, failure) from failure
+                error = failure
+            patience.pause_or_raise(self.url, error)
+
+
+class Patience:
+    """Growing pauses, until the time is up."""
+
+    def __init__(self, seconds: float) -> None:
+        self._deadline = time.monotonic() + seconds
+        self._pause = PAUSE_FIRST_S
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is no time left."""
+        return time.monotonic() >= self._deadline
+
+    def pause_or_raise(self, url: str, error: Exception | None) -> None:
+        """Wait a little; raises ConnectionFailed once the time is up."""
+        if self.is_over:
+            raise unreachable(url, error) from error
+        time.sleep(min(self._pause, max(self._deadline - time.monotonic(), 0.0)))
+        self._pause = min(self._pause * 1.6, PAUSE_MOST_S)
+
+
+def unreachable(url: str, error: Exception | None) -> ConnectionFailed:
+    why = f" ({error})" if error is not None and str(error) else ""
+    return ConnectionFailed(
+        f"The service at {url} cannot be reached{why}.", "Check that it runs: `make up` starts one."
+    )
+
+
+def segment(name: str) -> str:
+    """One path segment."""
+    return quote(name, safe="") or "-"
+
+
+def poll_pause(answer: httpx.Response) -> float:
+    """Seconds until the next look, as the service asks."""
+    try:
+        wanted = float(answer.headers.get("Retry-After", "1"))
+    except ValueError:
+        wanted = 1.0
+    return min(max(wanted, POLL_MIN_S), POLL_MAX_S)
+
+
+def problem_of(answer: httpx.Response) -> ApiProblem:
+    """An error answer as an exception; also one that is no problem document."""
+    found: dict[str, Any] = {}
+    with suppress(ValueError):
+        loaded = answer.json()
+        found = loaded if isinstance(loaded, dict) else {}
+    return ApiProblem(
+        answer.status_code,
+        str(found.get("code", "http_error")),
+        str(found.get("detail", f"The service answered {answer.status_code}.")),
+        str(found.get("hint", "")),
+        tuple((str(item["path"]), str(item["detail"])) for item in found.get("errors", [])),
+    )
+
+
+def checked(answer: httpx.Response) -> httpx.Response:
+    """The answer, if it is a success. Raises ApiProblem."""
+    if answer.is_success:
+        return answer
+    raise problem_of(answer)

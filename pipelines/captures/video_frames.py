@@ -1,0 +1,200 @@
+"""Decoding a video once, frame by frame, through a pipe: upright, SDR, reduced, with true times.
+
+Frames arrive as planes of full-range BT.601 Y'CbCr 4:2:0, which is what a JPEG holds: the frames
+that are kept are written without another conversion of colours. Memory stays at a few frames.
+"""
+
+from __future__ import annotations
+
+import queue
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import PIL.Image
+
+from pipelines.errors import ToolError
+from pipelines.stage import StageContext
+from pipelines.tools.ffmpeg import has_filter, passthrough_timing, run_ffmpeg, untrusted_input
+
+Plane = npt.NDArray[np.uint8]
+
+SHARPNESS_SIDE_PX = 960
+"""Sharpness is measured at about this long side: below it noise counts less than blur."""
+
+_TIMES_WAIT_S = 60.0
+_HDR_TRANSFER = {"hlg": "arib-std-b67", "pq": "smpte2084"}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One decoded frame.
+
+    index: among all decoded frames, 0-based. time_s: since the start of the file.
+    luma: [height, width]; chroma: two planes, [ceil(height / 2), ceil(width / 2)]; uint8.
+    """
+
+    index: int
+    time_s: float
+    luma: Plane
+    chroma: tuple[Plane, Plane]
+
+    def sharpness(self) -> float:
+        """Variance of the Laplacian of the luma: falls with blur; comparable between neighbours.
+
+        Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
+        """
+        factor = max(1, round(max(self.luma.shape) / SHARPNESS_SIDE_PX))
+        rows, columns = (size // factor for size in self.luma.shape)
+        cropped = self.luma[: rows * factor, : columns * factor]
+        blocks = cropped.reshape(rows, factor, columns, factor)
+        small = blocks.mean(axis=(1, 3), dtype=np.float32)
+        laplacian = (
+            small[:-2, 1:-1] + small[2:, 1:-1] + small[1:-1, :-2] + small[1:-1, 2:]
+        ) - 4.0 * small[1:-1, 1:-1]
+        return float(laplacian.var())
+
+    def save(self, path: Path, quality: int) -> None:
+        """Write as a baseline JPEG, 4:2:0, with no metadata."""
+        height, width = self.luma.shape
+        full = [
+            PIL.Image.fromarray(plane.repeat(2, axis=0).repeat(2, axis=1)[:height, :width])
+            for plane in self.chroma
+        ]
+        picture = PIL.Image.merge("YCbCr", [PIL.Image.fromarray(self.luma), *full])
+        picture.save(path, "JPEG", quality=quality, subsampling=2)
+
+
+@dataclass(frozen=True)
+class DecodePlan:
+    """What is decoded.
+
+    width, height: of the upright, reduced frames. hdr: as in `VideoInfo`.
+    step_s: at most one frame is delivered per cell of this length (from `start_s` on); 0 for all.
+    """
+
+    width: int
+    height: int
+    hdr: str = "none"
+    start_s: float = 0.0
+    step_s: float = 0.0
+
+
+def can_tone_map() -> bool:
+    """Whether this ffmpeg can turn HDR into SDR."""
+    return has_filter("zscale") and has_filter("tonemap")
+
+
+def reduced_size(width: int, height: int, long_side_px: int) -> tuple[int, int]:
+    """The size with at most that long side, never larger than it was."""
+    scale = min(1.0, long_side_px / max(width, height))
+    return max(2, round(width * scale)), max(2, round(height * scale))
+
+
+def filter_chain(plan: DecodePlan) -> str:
+    """The ffmpeg filters of a plan; ffmpeg itself puts the rotation in front of them."""
+    parts = ["showinfo@all=checksum=0"]
+    if plan.step_s > 0:
+        cell = f"floor(({{}}-{plan.start_s:.9f})/{plan.step_s:.9f})"
+        condition = f"gt({cell.format('t')},{cell.format('prev_selected_t')})"
+        parts.append(f"select='isnan(prev_selected_t)+{condition}'")
+    parts.append("showinfo@kept=checksum=0")
+    parts.append(f"scale={plan.width}:{plan.height}:flags=bicubic+accurate_rnd")
+    if plan.hdr in _HDR_TRANSFER and can_tone_map():
+        # npl is the brightness of SDR white in the HDR signal (BT.2408: 203 cd/m2).
+        parts.append(
+            f"zscale=tin={_HDR_TRANSFER[plan.hdr]}:pin=bt2020:min=bt2020nc:t=linear:npl=203"
+        )
+        parts.append("format=gbrpf32le,zscale=p=bt709,tonemap=mobius:param=0.7:desat=0")
+        parts.append("zscale=t=iec61966-2-1:m=170m:r=full,format=yuv420p")
+    else:
+        parts.append("scale=out_color_matrix=bt601:out_range=full,format=yuv420p")
+    return ",".join(parts)
+
+
+class _Times:
+    """Reads the time of each delivered frame from what `showinfo` writes to stderr."""
+
+    _CONFIG = re.compile(r"\[showinfo@all @ [^\]]*\] config in time_base: (\d+)/(\d+)")
+    _FRAME = re.compile(r"\[showinfo@(all|kept) @ [^\]]*\] n: *(\d+) pts: *(-?\d+|NOPTS)")
+
+    def __init__(self) -> None:
+        self.kept: queue.Queue[tuple[int, float]] = queue.Queue()
+        self.num_decoded = 0
+        self._unit_s = 0.0
+        self._indices: dict[str, int] = {}
+        self.ended = threading.Event()
+
+    def on_line(self, line: str) -> None:
+        config = self._CONFIG.match(line)
+        if config:
+            self._unit_s = int(config.group(1)) / int(config.group(2))
+        frame = self._FRAME.match(line)
+        if not frame:
+            return
+        which, number, pts = frame.groups()
+        if which == "all":
+            self.num_decoded = int(number) + 1
+            self._indices[pts] = int(number)
+            return
+        index = self._indices[pts]
+        self._indices.clear()
+        # Without a time of its own a frame has at least its place in the order.
+        self.kept.put((index, float("nan") if pts == "NOPTS" else int(pts) * self._unit_s))
+
+
+def decode(
+    path: Path, plan: DecodePlan, ctx: StageContext, on_frame: Callable[[Frame], None]
+) -> int:
+    """Decode the video at `path` and hand on its frames in order of time.
+
+    Returns how many frames were decoded, also those that were not delivered. A frame's planes are
+    its own and may be kept. Raises ToolError and Cancelled, and what `on_frame` raises.
+    """
+    times = _Times()
+    width, height = plan.width, plan.height
+    half_w, half_h = (width + 1) // 2, (height + 1) // 2
+    frame_bytes = width * height + 2 * half_w * half_h
+    pending = bytearray()
+
+    def on_stdout(chunk: bytes) -> None:
+        pending.extend(chunk)
+        while len(pending) >= frame_bytes:
+            data = np.frombuffer(bytes(pending[:frame_bytes]), np.uint8)
+            del pending[:frame_bytes]
+            try:
+                index, time_s = times.kept.get(timeout=_TIMES_WAIT_S)
+            except queue.Empty:
+                raise ToolError("ffmpeg delivered a frame without its time.") from None
+            luma, rest = data[: width * height], data[width * height :]
+            blue, red = rest[: half_w * half_h], rest[half_w * half_h :]
+            on_frame(
+                Frame(
+                    index=index,
+                    time_s=time_s,
+                    luma=luma.reshape(height, width),
+                    chroma=(blue.reshape(half_h, half_w), red.reshape(half_h, half_w)),
+                )
+            )
+
+    stream = untrusted_input(path).output(
+        "pipe:1",
+        map="0:V:0",
+        f="rawvideo",
+        vf=filter_chain(plan),
+        **passthrough_timing(),
+        **{"an": None, "sn": None, "dn": None},
+    )
+    run_ffmpeg(
+        stream,
+        log_level="info",
+        time_limit_s=float("inf"),
+        is_cancelled=ctx.is_cancelled,
+        on_line=times.on_line,
+        on_stdout=on_stdout,
+    )
+    return times.num_decoded

@@ -1,0 +1,198 @@
+"""Training on an analytic scene: quality, resuming, progress and failure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from pipelines.nerf.cameras import Cameras
+from pipelines.nerf.data import ImageData
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.metrics import psnr
+from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.training import TrainProgress, learning_rate, train
+from tests.unit.pipelines.nerf.toy_scene import (
+    RADIUS,
+    SIZE,
+    tiny_config,
+    toy_cameras,
+    toy_color,
+    toy_images,
+)
+
+HELD_OUT = 5
+
+
+@pytest.fixture(scope="module")
+def cameras() -> Cameras:
+    return toy_cameras()
+
+
+@pytest.fixture(scope="module")
+def images(cameras: Cameras) -> ImageData:
+    return toy_images(cameras)
+
+
+@pytest.fixture(scope="module")
+def trained(images: ImageData, cameras: Cameras) -> Nerfacto:
+    config = tiny_config(max_steps=150)
+    config = replace(config, model=replace(config.model, camera_mode="off"))
+    indices = [index for index in range(len(cameras)) if index != HELD_OUT]
+    return train(images, cameras, indices, config, seed=0)
+
+
+def _held_out_psnr(model: Nerfacto, images: ImageData, cameras: Cameras) -> float:
+    with torch.no_grad():
+        rgb = model(cameras.image_rays(HELD_OUT))["rgb"].reshape(SIZE, SIZE, 3)
+    return psnr(rgb, images.image(HELD_OUT))
+
+
+def test_a_held_out_view_of_a_ball_reaches_twenty_db(
+    trained: Nerfacto, images: ImageData, cameras: Cameras
+) -> None:
+    torch.manual_seed(0)
+    untrained = Nerfacto(trained.config, trained.num_train_images).eval()
+    assert _held_out_psnr(untrained, images, cameras) < 14.0
+    assert _held_out_psnr(trained, images, cameras) > 20.0
+
+
+def test_the_depth_of_the_ball_is_found(trained: Nerfacto, cameras: Cameras) -> None:
+    rays = cameras.image_rays(HELD_OUT)
+    _, truth = toy_color(rays)
+    with torch.no_grad():
+        depth = trained(rays)["depth"]
+    hit = truth.isfinite()
+    error = (depth - truth)[hit].abs()
+    assert float(error.median()) < 0.3 * RADIUS
+
+
+def _same_parameters(one: Nerfacto, other: Nerfacto) -> bool:
+    pairs = zip(one.state_dict().values(), other.state_dict().values(), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+class _StopError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("engine", ["plain", "fast"])
+def test_a_resumed_run_ends_as_an_uninterrupted_one(
+    images: ImageData, cameras: Cameras, tmp_path: Path, engine: str
+) -> None:
+    config = tiny_config(max_steps=30, engine=engine)
+    # Rare proposal updates, so that the count since the last one matters.
+    config = replace(config, model=replace(config.model, proposal_warmup_steps=10))
+    indices = list(range(8))
+    whole = train(images, cameras, indices, config, seed=3)
+
+    path = tmp_path / "checkpoint.pt"
+    train(images, cameras, indices, replace(config, max_steps=17), seed=3, checkpoint_path=path)
+    seen: list[int] = []
+    resumed = train(
+        images,
+        cameras,
+        indices,
+        config,
+        seed=3,
+        checkpoint_path=path,
+        on_progress=lambda progress: seen.append(progress.step),
+    )
+    assert seen == list(range(18, 31))
+    assert _same_parameters(whole, resumed)
+    other = train(images, cameras, indices, config, seed=4)
+    assert not _same_parameters(whole, other)
+
+
+def test_an_exception_in_progress_keeps_the_last_checkpoint(
+    images: ImageData, cameras: Cameras, tmp_path: Path
+) -> None:
+    config = tiny_config(max_steps=6)
+    path = tmp_path / "checkpoint.pt"
+    train(images, cameras, [0, 1, 2], replace(config, max_steps=3), seed=0, checkpoint_path=path)
+    before = path.read_bytes()
+
+    def stop(progress: TrainProgress) -> None:
+        if progress.step == 5:
+            raise _StopError
+
+    with pytest.raises(_StopError):
+        train(images, cameras, [0, 1, 2], config, seed=0, checkpoint_path=path, on_progress=stop)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_checkpoint_of_another_run_is_refused(
+    images: ImageData, cameras: Cameras, tmp_path: Path
+) -> None:
+    path = tmp_path / "checkpoint.pt"
+    config = tiny_config(max_steps=2)
+    train(images, cameras, [0, 1, 2], config, seed=0, checkpoint_path=path)
+    with pytest.raises(NerfError, match="other options") as caught:
+        train(images, cameras, [0, 1, 2], config, seed=1, checkpoint_path=path)
+    assert caught.value.code == "bad_checkpoint"
+
+
+def test_a_loss_that_is_not_finite_is_named(images: ImageData, cameras: Cameras) -> None:
+    def spoil(step: int, model: Nerfacto) -> None:
+        if step == 2:
+            layer = model.field.color_mlp.layers[0]
+            assert isinstance(layer, torch.nn.Linear)
+            layer.bias.fill_(math.nan)
+
+    config = tiny_config(max_steps=5, preview_every_steps=1)
+    with pytest.raises(NerfError, match="rgb loss became nan at step 2") as caught:
+        train(images, cameras, [0, 1], config, seed=0, on_preview=spoil)
+    assert caught.value.code == "non_finite_loss"
+
+
+def test_progress_previews_and_checkpoints_are_reported(
+    images: ImageData, cameras: Cameras, tmp_path: Path
+) -> None:
+    reports: list[TrainProgress] = []
+    previews: list[tuple[int, bool]] = []
+    saved: list[bool] = []
+    model = train(
+        images,
+        cameras,
+        [0, 1, 2],
+        tiny_config(max_steps=9, preview_every_steps=4),
+        seed=0,
+        checkpoint_path=tmp_path / "checkpoint.pt",
+        on_progress=reports.append,
+        on_preview=lambda step, model: previews.append((step, model.training)),
+        on_checkpoint=lambda: saved.append((tmp_path / "checkpoint.pt").is_file()),
+    )
+    assert [report.step for report in reports] == list(range(1, 10))
+    assert reports[-1].fraction == 1.0
+    assert reports[-1].eta_s == 0.0
+    assert set(reports[0].losses) == {"rgb", "interlevel", "distortion", "camera"}
+    assert math.isclose(reports[0].psnr, -10 * math.log10(reports[0].losses["rgb"]))
+    assert previews == [(4, False), (8, False)]
+    assert saved == [True]
+    assert not model.training
+
+
+def test_the_time_limit_ends_training(images: ImageData, cameras: Cameras) -> None:
+    reports: list[TrainProgress] = []
+    config = tiny_config(max_steps=10**6, max_seconds=0.2)
+    train(images, cameras, [0, 1], config, seed=0, on_progress=reports.append)
+    assert 0.2 <= reports[-1].elapsed_s < 5.0
+    assert reports[-1].fraction == 1.0
+    assert reports[-2].elapsed_s < 0.2
+
+
+def test_learning_rate_decays_exponentially() -> None:
+    assert math.isclose(learning_rate(0, 1e-2, 1e-4, 100), 1e-2)
+    assert math.isclose(learning_rate(50, 1e-2, 1e-4, 100), 1e-3)
+    assert math.isclose(learning_rate(500, 1e-2, 1e-4, 100), 1e-4)
+
+
+def test_images_and_cameras_must_fit(images: ImageData, cameras: Cameras) -> None:
+    with pytest.raises(NerfError, match="differ in number or size"):
+        train(images, cameras.resized(16), [0], tiny_config(), seed=0)
+    with pytest.raises(NerfError, match="no image to train on"):
+        train(images, cameras, [], tiny_config(), seed=0)

@@ -1,0 +1,102 @@
+"""`python -m worker`: one worker process, with as many slots as asked for.
+
+SIGTERM (and Ctrl-C) asks the running stages to stop, gives them back without counting an attempt,
+and ends within seconds. A worker that starts again under the same --id frees at once what its
+former self held.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import socket
+import sys
+import threading
+from typing import Any
+
+from celery.signals import worker_shutting_down
+
+from storage.queue import QUEUES
+from storage.settings import StorageSettings
+from worker.app import make_app
+from worker.housekeeping import detect_gpu
+from worker.runtime import WorkerIdentity, WorkerRuntime, set_current_runtime
+from worker.settings import WorkerSettings
+
+EXIT_LIMIT_S = 20.0
+
+
+def _queues(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not names or not set(names) <= set(QUEUES):
+        raise argparse.ArgumentTypeError(f"queues are {', '.join(QUEUES)}")
+    return names
+
+
+def _slots(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 64:
+        raise argparse.ArgumentTypeError("slots are a number from 1 to 64")
+    return int(text)
+
+
+def parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m worker", description="Runs stages of jobs.")
+    parser.add_argument("--slots", type=_slots, default=1, help="stages at once (default 1)")
+    parser.add_argument(
+        "--queues", type=_queues, default=QUEUES, help=f"any of {','.join(QUEUES)} (default all)"
+    )
+    parser.add_argument(
+        "--id",
+        default=f"{socket.gethostname()}-{os.getpid()}",
+        help="a name that stays the same when this worker is started again",
+    )
+    return parser.parse_args(arguments)
+
+
+def _exit_in_time() -> None:
+    timer = threading.Timer(EXIT_LIMIT_S, os._exit, args=(1,))
+    timer.daemon = True
+    timer.start()
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Serve until a signal."""
+    chosen = parse_arguments(sys.argv[1:] if arguments is None else arguments)
+    logging.basicConfig(
+        level=logging.INFO,
+        stream=sys.stderr,
+        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
+    )
+    storage = StorageSettings()
+    runtime = WorkerRuntime(
+        WorkerIdentity.of(chosen.id, chosen.slots, chosen.queues, detect_gpu()),
+        storage,
+        WorkerSettings(),
+        registry=os.environ.get("NERFWORKS_REGISTRY", "pipelines.registry"),
+    )
+    set_current_runtime(runtime)
+
+    def on_shutdown(**_: Any) -> None:
+        runtime.shutdown.set()
+        _exit_in_time()
+
+    worker_shutting_down.connect(on_shutdown, weak=False)
+    runtime.start()
+    try:
+        make_app(storage).worker_main(
+            [
+                "worker",
+                *("--pool", "threads", "--concurrency", str(chosen.slots)),
+                *("--queues", ",".join(runtime.identity.queues)),
+                *("--hostname", f"{chosen.id}@%h", "--loglevel", "INFO"),
+                *("--without-gossip", "--without-mingle", "--without-heartbeat"),
+            ]
+        )
+    finally:
+        runtime.close()
+
+
+if __name__ == "__main__":
+    main()

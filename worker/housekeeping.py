@@ -1,0 +1,142 @@
+"""The guarded loop in every worker's parent process. No beat, no leader: each round is harmless
+when several workers do it, because the database decides.
+
+    register    refresh the worker's row: it is live, and has this
+    reap        take back stages whose leases ran out
+    dispatch    ring again for ready stages that nobody came for
+    offer       let a free slot take a ready stage directly: work goes on without the broker, and
+                also where the consumer is stuck after the broker came back
+    clean       drop local folders of jobs that are over, and bytes of deleted records
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+import os
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from storage.db import Database, now
+from storage.deletions import drain_deletions
+from storage.leases import reap_expired
+from storage.objects import ObjectStore
+from storage.queries import WaitingStage, finished_jobs, ready_unclaimed
+from storage.queue import Bell
+from worker.settings import WorkerSettings
+
+_log = logging.getLogger("nerfworks.worker")
+CLEAN_STEP_S = 30.0
+
+
+def detect_gpu() -> bool:
+    """Whether this machine has an NVIDIA device that our torch could use. Imports no torch."""
+    if os.environ.get("CUDA_VISIBLE_DEVICES", "0").strip() in ("", "-1"):
+        return False
+    try:
+        if importlib.metadata.version("torch").endswith("+cpu"):
+            return False
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    if any(Path("/dev").glob("nvidia[0-9]*")):
+        return True
+    try:
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, timeout=20, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return listed.returncode == 0 and b"GPU" in listed.stdout
+
+
+def is_ring_due(stage: WaitingStage, moment: datetime, again_s: float) -> bool:
+    """Whether the bell should ring again.
+
+    At once when it never rang since the stage could run; then after `again_s`, twice that, and so
+    on, so that a long queue behind a busy worker does not fill the broker.
+    """
+    if stage.rung_at is None or stage.rung_at < stage.since:
+        return True
+    waited_s = (stage.rung_at - stage.since).total_seconds()
+    return moment - stage.rung_at >= timedelta(seconds=max(again_s, waited_s))
+
+
+class Housekeeping:
+    """One thread. A round that fails is logged; the next one comes all the same."""
+
+    def __init__(
+        self,
+        database: Database,
+        store: ObjectStore,
+        bell: Bell,
+        settings: WorkerSettings,
+        *,
+        work_dir: Path,
+        register: Callable[[], None],
+        offer: Callable[[], None],
+    ) -> None:
+        self._database = database
+        self._store = store
+        self._bell = bell
+        self._settings = settings
+        self._work_dir = work_dir
+        self._register = register
+        self._offer = offer
+        self._stopped = threading.Event()
+        self._cleaned_at = 0.0
+        self._thread = threading.Thread(target=self._loop, daemon=True, name="housekeeping")
+
+    def start(self) -> None:
+        """Start the loop."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float) -> None:
+        """End the loop after the round in progress."""
+        self._stopped.set()
+        self._thread.join(timeout_s)
+
+    def _loop(self) -> None:
+        duties = (self._register, self.reap, self.dispatch, self._offer, self._clean_by_time)
+        while not self._stopped.is_set():
+            for duty in duties:
+                try:
+                    duty()
+                except Exception:  # noqa: BLE001 the loop must outlive whatever a round meets
+                    _log.exception("housekeeping: %s failed", duty.__name__)
+            self._stopped.wait(self._settings.tick_s)
+
+    def reap(self) -> None:
+        """Take back stages whose leases ran out."""
+        with self._database.session_scope() as session:
+            ready = reap_expired(session)
+        if ready:
+            _log.warning("lost their workers: %s", ", ".join(ready))
+            self._bell.ring(self._database, ready)
+
+    def dispatch(self) -> None:
+        """Ring for ready stages that nobody came for."""
+        with self._database.read_scope() as session:
+            moment = now(session)
+            waiting = ready_unclaimed(session)
+        due = [
+            stage.id for stage in waiting if is_ring_due(stage, moment, self._settings.ring_again_s)
+        ]
+        self._bell.ring(self._database, due)
+
+    def clean(self) -> None:
+        """Drop what finished jobs left on this machine, and bytes of deleted records."""
+        drain_deletions(self._database, self._store)
+        folders = list(self._work_dir.iterdir()) if self._work_dir.is_dir() else []
+        if folders:
+            with self._database.read_scope() as session:
+                over = finished_jobs(session, [folder.name for folder in folders])
+            for name in over:
+                shutil.rmtree(self._work_dir / name, ignore_errors=True)
+
+    def _clean_by_time(self) -> None:
+        if time.monotonic() - self._cleaned_at >= CLEAN_STEP_S:
+            self._cleaned_at = time.monotonic()
+            self.clean()

@@ -1,0 +1,106 @@
+"""How an attempt can end other than well: exceptions inside the runner, and what people read."""
+
+from __future__ import annotations
+
+import errno
+import signal
+from typing import Any
+
+from pipelines.errors import PipelineError, ResourceError
+from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
+from storage.leases import MAX_CRASHES
+
+MAX_MEMORY_CRASHES = 2
+MAX_FAULT_CRASHES = 2
+
+
+class StopRunError(Exception):
+    """The attempt must stop: `reason` is "cancel", "lost" or "shutdown"."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class StageFailedError(Exception):
+    """The stage ended with an error of its own: `{code, message, hint, retryable, details}`."""
+
+    def __init__(self, error: dict[str, Any]) -> None:
+        super().__init__(str(error.get("code")))
+        self.error = error
+
+
+class StageCrashedError(Exception):
+    """The stage's process died. After `max_crashes` such ends the stage fails with `error`."""
+
+    def __init__(self, error: dict[str, Any], max_crashes: int) -> None:
+        super().__init__(str(error["code"]))
+        self.error = error
+        self.max_crashes = max_crashes
+
+
+def crash_of(stage: str, status: int, out_of_memory: bool) -> StageCrashedError:
+    """What an exit status of the stage's process means.
+
+    status: as subprocess gives it, negative for a signal.
+    """
+    if out_of_memory:
+        error = ResourceError(
+            f"Memory ran out during {stage}: the system stopped it.",
+            code="out_of_memory",
+            hint="Use a smaller preset, or fewer or smaller images, or a larger machine.",
+        )
+        return StageCrashedError(error.as_dict(), MAX_MEMORY_CRASHES)
+    if status in (-signal.SIGKILL, 128 + signal.SIGKILL, -signal.SIGTERM):
+        error = ResourceError(
+            f"The process that ran {stage} was killed from outside.",
+            code="worker_lost",
+            hint="Look at the worker's log and the machine's memory; then submit the job again.",
+        )
+        return StageCrashedError(error.as_dict(), MAX_CRASHES)
+    how = f"signal {-status}" if status < 0 else f"status {status}"
+    fault = PipelineError(
+        f"The process that ran {stage} broke down ({how}).",
+        code="stage_crashed",
+        hint="This is a fault of the service: see the job's logs for the last lines before it.",
+    )
+    return StageCrashedError(fault.as_dict(), MAX_FAULT_CRASHES)
+
+
+def time_limit_of(stage: str, limit_s: float) -> StageFailedError:
+    """The stage ran for too long."""
+    error = PipelineError(
+        f"The stage {stage} did not end within {limit_s:.0f} seconds.",
+        code="time_limit",
+        hint="Use a smaller preset, or a faster machine.",
+    )
+    return StageFailedError(error.as_dict())
+
+
+def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
+    """What an exception in the worker around the stage means, as an error of the stage."""
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    if full or isinstance(error, ObjectStoreFullError):
+        return ResourceError(
+            f"The disk is full: the files of {stage} could not be stored.",
+            code="disk_full",
+            hint="Free some space on the worker's disk or the object store; then submit again.",
+        ).as_dict()
+    if isinstance(error, ObjectMissingError):
+        return PipelineError(
+            f"A file that {stage} needs is no longer stored.",
+            code="input_missing",
+            hint="Upload the capture again and submit a new job.",
+        ).as_dict()
+    if isinstance(error, ObjectStoreError):
+        return ResourceError(
+            f"The object store did not answer while {stage} moved its files.",
+            code="object_store_unavailable",
+            hint="Check the object store; then submit the job again.",
+        ).as_dict()
+    return PipelineError(
+        f"The worker failed around {stage} with {type(error).__name__}.",
+        code="internal_error",
+        hint="This is a fault of the service: see the worker's log.",
+        retryable=True,
+    ).as_dict()

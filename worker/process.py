@@ -1,0 +1,172 @@
+"""The worker's end of a stage process: starts it, talks to it, kills it and all that it started."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from worker.stage_process import END_OF_LOG
+
+_log = logging.getLogger("nerfworks.worker")
+_SECRET_NAME = re.compile(
+    r"^(AWS|AZURE|GOOGLE|GCP|GCLOUD|S3|CELERY|PG)_?"
+    r"|^NERFWORKS_(?!HOME$|REGISTRY$)"
+    r"|SECRET|PASSWORD|TOKEN|CREDENTIAL|API_?KEY|ACCESS_?KEY|DATABASE_URL|REDIS_URL"
+)
+_LINE_BYTES = 8_192
+_EXIT_WAIT_S = 5.0
+
+
+def scrubbed_environment(environment: Mapping[str, str], threads: int) -> dict[str, str]:
+    """The environment of a stage process: without keys and addresses of the service.
+
+    threads: how many the numeric libraries may use, where the environment does not say.
+    """
+    kept = {name: value for name, value in environment.items() if not _SECRET_NAME.search(name)}
+    root = str(Path(__file__).resolve().parent.parent)
+    paths = [root, *filter(None, kept.get("PYTHONPATH", "").split(os.pathsep))]
+    kept["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+    kept["PYTHONUNBUFFERED"] = "1"
+    kept.setdefault("OMP_NUM_THREADS", str(threads))
+    return kept
+
+
+def oom_kills() -> int:
+    """How many processes the kernel has killed for memory, in our control group or at all."""
+    total = 0
+    for path in ("/sys/fs/cgroup/memory.events", "/proc/vmstat"):
+        with contextlib.suppress(OSError, ValueError):
+            for line in Path(path).read_text().splitlines():
+                name, _, value = line.partition(" ")
+                if name == "oom_kill":
+                    total += int(value)
+    return total
+
+
+class StageProcess:
+    """A warm child. One run at a time; not safe for several threads at once.
+
+    messages: what the child sent, ending with {"type": "exit"} when it is gone.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.messages: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._on_line: Callable[[str], None] = lambda line: None
+        self._log_ended = threading.Event()
+        self._run_id = ""
+        self._oom_before = oom_kills()
+        message_read, message_write = os.pipe()
+        life_read, self._life_write = os.pipe()
+        try:
+            self._process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "worker.stage_process"),
+                    *("--message-fd", str(message_write), "--life-fd", str(life_read)),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                pass_fds=(message_write, life_read),
+                start_new_session=True,
+                env=scrubbed_environment(os.environ, threads),
+            )
+        finally:
+            os.close(message_write)
+            os.close(life_read)
+        self._readers = [
+            threading.Thread(target=self._read_messages, args=(message_read,), daemon=True),
+            threading.Thread(target=self._read_log, daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def pid(self) -> int:
+        """The child's process id, also that of its group."""
+        return self._process.pid
+
+    def is_alive(self) -> bool:
+        """Whether the child still runs."""
+        return self._process.poll() is None
+
+    def exit_reason(self) -> tuple[int, bool]:
+        """(exit status, negative for a signal; whether memory ran out). Only after the exit."""
+        status = self._process.wait(_EXIT_WAIT_S)
+        killed = status in (-signal.SIGKILL, 128 + signal.SIGKILL)
+        return status, killed and oom_kills() > self._oom_before
+
+    def start_run(self, run_id: str, on_line: Callable[[str], None], **command: Any) -> None:
+        """Start a run. Raises BrokenPipeError where the child is gone."""
+        self._run_id, self._on_line = run_id, on_line
+        self._log_ended.clear()
+        self._send({"do": "run", "run_id": run_id, **command})
+
+    def ask_to_cancel(self) -> None:
+        """Ask the stage to stop at its next report of progress."""
+        with contextlib.suppress(BrokenPipeError):
+            self._send({"do": "cancel", "run_id": self._run_id})
+
+    def finish_log(self, timeout_s: float) -> None:
+        """Wait until the last line of the run has arrived."""
+        self._log_ended.wait(timeout_s)
+        self._on_line = lambda line: None
+
+    def kill(self) -> None:
+        """Kill the child and its group, and wait until it is gone."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.kill()
+        try:
+            self._process.wait(_EXIT_WAIT_S)
+        except subprocess.TimeoutExpired:
+            _log.error("stage process %s does not die: it hangs in the kernel", self.pid)
+        self._close()
+
+    def _close(self) -> None:
+        if self._life_write >= 0:
+            os.close(self._life_write)
+            self._life_write = -1
+        if self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+
+    def _send(self, command: dict[str, Any]) -> None:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write((json.dumps(command) + "\n").encode())
+            self._process.stdin.flush()
+        except (OSError, ValueError) as error:
+            raise BrokenPipeError("the stage process is gone") from error
+
+    def _read_messages(self, descriptor: int) -> None:
+        with os.fdopen(descriptor, encoding="utf-8") as file:
+            for line in file:
+                try:
+                    self.messages.put(json.loads(line))
+                except ValueError:
+                    break  # cut off by the child's death
+        self._log_ended.set()
+        self.messages.put({"type": "exit"})
+
+    def _read_log(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as file:
+            while raw := file.readline(_LINE_BYTES):
+                line = raw.decode("utf-8", "replace").rstrip("\r\n")
+                if line.startswith(END_OF_LOG):
+                    if line.removeprefix(END_OF_LOG) == self._run_id:
+                        self._log_ended.set()
+                elif line:
+                    # A progress bar redraws one line with carriage returns: keep its last state.
+                    self._on_line(line.rpartition("\r")[2])

@@ -1,0 +1,329 @@
+"""One attempt of one stage: fetch inputs, run it in the slot's process, publish, record.
+
+Whatever happens ends in exactly one operation of `storage.leases`; one that comes too late, because
+the lease was lost, is refused there, and what was uploaded is deleted again.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from pipelines.stage import Stage
+from pipelines.workspace import Workspace
+from storage import keys
+from storage.db import Database
+from storage.errors import LostLeaseError, NotFoundError, StorageError
+from storage.leases import (
+    Claim,
+    cancel_stage,
+    crash_stage,
+    fail_stage,
+    release_stage,
+    succeed_stage,
+)
+from storage.objects import ObjectStore
+from storage.queries import StageWork, stage_work
+from worker.checkpoints import CheckpointUploader, Snapshot
+from worker.outcomes import (
+    MAX_MEMORY_CRASHES,
+    StageCrashedError,
+    StageFailedError,
+    StopRunError,
+    crash_of,
+    failure_of,
+    time_limit_of,
+)
+from worker.process import StageProcess
+from worker.progress import LeaseKeeper
+from worker.settings import WorkerSettings
+from worker.transfer import (
+    fetch_capture,
+    fetch_inputs,
+    restore_checkpoint,
+    upload_folder,
+    write_job_file,
+)
+
+_log = logging.getLogger("nerfworks.worker")
+MESSAGE_STEP_S = 0.25
+LOG_END_S = 2.0
+CHECKPOINT_END_S = 120.0
+RECORD_STEP_S = 1.0
+Result = TypeVar("Result")
+
+
+class Registry(Protocol):
+    """What a registry module offers: `pipelines.registry`, or a test's own."""
+
+    def get_stage(self, name: str) -> Stage: ...
+
+
+def load_registry(name: str) -> Registry:
+    """The registry module of that dotted name. Reading it imports no stage's code."""
+    module: Registry = importlib.import_module(name)
+    return module
+
+
+class Runner:
+    """Runs attempts for one slot, in one warm process that is replaced when it dies.
+
+    shutdown: set when the worker ends; a running attempt then gives its stage back.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        store: ObjectStore,
+        settings: WorkerSettings,
+        *,
+        work_dir: Path,
+        registry: str,
+        threads: int,
+        shutdown: threading.Event,
+    ) -> None:
+        self._database = database
+        self._store = store
+        self._settings = settings
+        self._work_dir = work_dir
+        self._registry_name = registry
+        self._registry = load_registry(registry)
+        self._threads = threads
+        self._shutdown = shutdown
+        self._process: StageProcess | None = None
+
+    def close(self) -> None:
+        """Kill the warm process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process = None
+
+    def run(self, claim: Claim) -> list[str]:
+        """Run a claimed stage to its recorded end. Ids of stages that became ready."""
+        _log.info("%s: attempt %d", claim.stage_id, claim.attempt)
+        prefix = keys.attempt_prefix(claim.job_id, claim.name, claim.attempt, claim.token)
+        with LeaseKeeper(self._database, claim, self._settings) as keeper:
+            try:
+                manifest = self._attempt(claim, keeper, prefix)
+                record: Callable[[Session], Any] = lambda session: succeed_stage(  # noqa: E731
+                    session, claim, manifest=manifest, output_prefix=prefix
+                )
+            except Exception as error:  # noqa: BLE001 every end of an attempt is recorded
+                record = self._record_of(claim, error)
+                self._discard(prefix)
+            keeper.flush()
+            try:
+                ready = self._record(record)
+            except (LostLeaseError, NotFoundError):
+                _log.warning("%s: lease lost, work thrown away", claim.stage_id)
+                self._discard(prefix)
+                return []
+        if not isinstance(ready, list):
+            _log.info("%s: %s", claim.stage_id, ready or "cancelled")
+            return []
+        _log.info("%s: succeeded", claim.stage_id)
+        self._discard(keys.stage_prefix(claim.job_id, claim.name), keep=prefix)
+        return ready
+
+    def _guard_of(self, keeper: LeaseKeeper) -> Callable[[], None]:
+        def guard() -> None:
+            if keeper.lost.is_set():
+                raise StopRunError("lost")
+            if keeper.cancel_requested.is_set():
+                raise StopRunError("cancel")
+            if self._shutdown.is_set():
+                raise StopRunError("shutdown")
+
+        return guard
+
+    def _attempt(self, claim: Claim, keeper: LeaseKeeper, prefix: str) -> dict[str, Any]:
+        guard, workers = self._guard_of(keeper), self._settings.transfers
+        stage = self._registry.get_stage(claim.name)
+        with self._database.read_scope() as session:
+            work = stage_work(session, claim)
+        workspace = Workspace(self._work_dir / claim.job_id)
+        write_job_file(workspace, work)
+        if self._is_near_the_capture(stage):
+            fetch_capture(self._store, workspace, work, guard)
+        fetch_inputs(self._store, workspace, stage.reads, work, guard, workers=workers)
+        restore_checkpoint(
+            self._store, workspace, stage.name, work.checkpoint_prefix, guard, workers=workers
+        )
+        uploader = CheckpointUploader(
+            self._database, self._store, claim, self._lease_guard(keeper), workers=workers
+        )
+        finish = False
+        try:
+            manifest = self._run_in_process(stage, claim, keeper, work, workspace, uploader)
+        except (StageFailedError, StageCrashedError, StopRunError):
+            finish = not (keeper.lost.is_set() or keeper.cancel_requested.is_set())
+            raise
+        finally:
+            limit_s = self._settings.cancel_grace_s if self._shutdown.is_set() else CHECKPOINT_END_S
+            uploader.close(finish=finish, timeout_s=limit_s)
+        upload_folder(self._store, workspace.stage(stage.name), prefix, guard, workers=workers)
+        return manifest
+
+    def _lease_guard(self, keeper: LeaseKeeper) -> Callable[[], None]:
+        """A checkpoint is worth keeping also when the worker shuts down."""
+
+        def guard() -> None:
+            if keeper.lost.is_set() or keeper.cancel_requested.is_set():
+                raise LostLeaseError("the stage is cancelled, or no longer ours")
+
+        return guard
+
+    def _is_near_the_capture(self, stage: Stage) -> bool:
+        """Whether the stage gets the uploaded bytes: it reads nothing, or only such stages."""
+        return all(not self._registry.get_stage(name).reads for name in stage.reads)
+
+    def _ensure_process(self) -> StageProcess:
+        if self._process is None or not self._process.is_alive():
+            self.close()
+            self._process = StageProcess(self._threads)
+        return self._process
+
+    def _run_in_process(
+        self,
+        stage: Stage,
+        claim: Claim,
+        keeper: LeaseKeeper,
+        work: StageWork,
+        workspace: Workspace,
+        uploader: CheckpointUploader,
+    ) -> dict[str, Any]:
+        process = self._ensure_process()
+        try:
+            process.start_run(
+                f"{claim.token}-{claim.stage_id}",
+                keeper.log,
+                do="run",
+                registry=self._registry_name,
+                stage=stage.name,
+                options=work.options,
+                root=str(workspace.root),
+                seed=work.seed,
+            )
+            return self._follow(process, stage, keeper, uploader)
+        except BrokenPipeError:
+            raise crash_of(stage.name, *process.exit_reason()) from None
+        except StageCrashedError:
+            self.close()  # also where memory ran out and the process lives: it gives it back
+            raise
+        except StageFailedError as error:
+            if error.error["code"] == "internal_error":
+                self.close()  # its state cannot be trusted
+            raise
+        finally:
+            process.finish_log(LOG_END_S if process.is_alive() else 0.0)
+            if not process.is_alive():
+                self.close()
+
+    def _follow(
+        self,
+        process: StageProcess,
+        stage: Stage,
+        keeper: LeaseKeeper,
+        uploader: CheckpointUploader,
+    ) -> dict[str, Any]:
+        """Take the process's messages until the stage has ended, or must."""
+        guard = self._guard_of(keeper)
+        deadline = time.monotonic() + stage.time_limit_s
+        while True:
+            try:
+                guard()
+            except StopRunError:
+                self._stop(process)
+                raise
+            if time.monotonic() > deadline:
+                process.kill()
+                raise time_limit_of(stage.name, stage.time_limit_s)
+            try:
+                message = process.messages.get(timeout=MESSAGE_STEP_S)
+            except queue.Empty:
+                continue
+            kind = message["type"]
+            if kind == "progress":
+                keeper.report(message["fraction"], message["message"], message["eta_s"])
+            elif kind == "checkpoint":
+                uploader.offer(Snapshot(Path(message["path"]), message["files"]))
+            elif kind == "done":
+                manifest: dict[str, Any] = message["manifest"]
+                return manifest
+            elif kind == "failed":
+                if message["error"]["code"] == "out_of_memory":
+                    raise StageCrashedError(message["error"], MAX_MEMORY_CRASHES)
+                raise StageFailedError(message["error"])
+            elif kind == "cancelled":
+                raise StopRunError("cancel")
+            elif kind == "exit":
+                raise crash_of(stage.name, *process.exit_reason())
+
+    def _stop(self, process: StageProcess) -> None:
+        """Ask the stage to stop; kill it, and what it started, where it does not in time."""
+        process.ask_to_cancel()
+        deadline = time.monotonic() + self._settings.cancel_grace_s
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                message = process.messages.get(timeout=left)
+            except queue.Empty:
+                break
+            if message["type"] in ("done", "failed", "cancelled", "exit"):
+                return
+        self.close()
+
+    def _record_of(self, claim: Claim, error: Exception) -> Callable[[Session], Any]:
+        """The operation that records how an attempt ended."""
+        if isinstance(error, StopRunError):
+            if error.reason == "lost":
+                return lambda session: _raise(LostLeaseError(claim.stage_id))
+            if error.reason == "shutdown":
+                return lambda session: release_stage(session, claim)
+            return lambda session: cancel_stage(session, claim)
+        if isinstance(error, StageCrashedError):
+            crash = error
+            _log.warning("%s: %s", claim.stage_id, crash.error["message"])
+            return lambda session: crash_stage(
+                session, claim, crash.error, max_crashes=crash.max_crashes
+            )
+        if isinstance(error, StageFailedError):
+            failure = error.error
+        else:
+            _log.error("%s: the attempt broke off", claim.stage_id, exc_info=error)
+            failure = failure_of(claim.name, error)
+        retryable = bool(failure.pop("retryable", False))
+        return lambda session: fail_stage(session, claim, failure, retryable=retryable)
+
+    def _record(self, operation: Callable[[Session], Result]) -> Result:
+        """Run a closing operation, again while the database is away and the lease may hold."""
+        deadline = time.monotonic() + self._settings.lease_s
+        while True:
+            try:
+                with self._database.session_scope() as session:
+                    return operation(session)
+            except SQLAlchemyError as error:
+                _log.warning("the end of a stage waits for the database: %s", error)
+                if time.monotonic() > deadline or self._shutdown.wait(RECORD_STEP_S):
+                    raise LostLeaseError("the database does not answer") from error
+
+    def _discard(self, prefix: str, keep: str | None = None) -> None:
+        """Delete what an attempt that does not count has uploaded."""
+        try:
+            for key in list(self._store.list(prefix)):
+                if keep is None or not key.startswith(keep):
+                    self._store.delete(key)
+        except StorageError as error:
+            _log.warning("left behind below %s: %s", prefix, error)
+
+
+def _raise(error: Exception) -> None:
+    raise error

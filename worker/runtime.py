@@ -1,0 +1,194 @@
+"""A worker without its bell: slots, claims and housekeeping. `worker.tasks` calls `serve`.
+
+A message only wakes a slot. A slot that has ended a stage goes on with whatever else this worker
+may take, oldest job first: the next stage of the same job finds its inputs on this machine.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import socket
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from storage.db import Database
+from storage.leases import Claim, claim_stage, release_worker
+from storage.objects import open_object_store
+from storage.queries import WaitingStage, ready_unclaimed
+from storage.queue import QUEUE_GPU, Bell, queue_for
+from storage.records import forget_worker, has_live_gpu, register_worker
+from storage.settings import StorageSettings
+from worker.housekeeping import Housekeeping
+from worker.runner import Runner
+from worker.settings import WorkerSettings
+
+_log = logging.getLogger("nerfworks.worker")
+
+
+@dataclass(frozen=True)
+class WorkerIdentity:
+    """Who a worker is and what it offers. queues: those it really serves."""
+
+    id: str
+    slots: int
+    queues: tuple[str, ...]
+    has_gpu: bool
+
+    @classmethod
+    def of(cls, worker_id: str, slots: int, queues: Sequence[str], has_gpu: bool) -> WorkerIdentity:
+        """Without a GPU a worker leaves the queue `gpu` alone: what no GPU worker is there for
+        comes over the queue `cpu`."""
+        served = tuple(name for name in queues if has_gpu or name != QUEUE_GPU)
+        return cls(worker_id, slots, served, has_gpu)
+
+
+class WorkerRuntime:
+    """The slots of one worker process and the loop that keeps house."""
+
+    def __init__(
+        self,
+        identity: WorkerIdentity,
+        storage: StorageSettings,
+        settings: WorkerSettings,
+        *,
+        registry: str,
+    ) -> None:
+        self.identity = identity
+        self.shutdown = threading.Event()
+        self._settings = settings
+        self._database = Database(storage.resolved_database_url)
+        self._store = open_object_store(storage)
+        self._bell = Bell(storage.redis_url)
+        self._direct = ThreadPoolExecutor(identity.slots, thread_name_prefix="direct")
+        self._free: queue.SimpleQueue[Runner] = queue.SimpleQueue()
+        self._runners = [
+            Runner(
+                self._database,
+                self._store,
+                settings,
+                work_dir=storage.work_dir,
+                registry=registry,
+                threads=max((os.cpu_count() or 1) // identity.slots, 1),
+                shutdown=self.shutdown,
+            )
+            for _ in range(identity.slots)
+        ]
+        for runner in self._runners:
+            self._free.put(runner)
+        self._housekeeping = Housekeeping(
+            self._database,
+            self._store,
+            self._bell,
+            settings,
+            work_dir=storage.work_dir,
+            register=self._register,
+            offer=self._offer,
+        )
+
+    def start(self) -> None:
+        """Free what this worker's former self held, and start to keep house."""
+        with self._database.session_scope() as session:
+            freed = release_worker(session, self.identity.id)
+        if freed:
+            _log.warning("a former self of this worker left: %s", ", ".join(freed))
+        self._register()
+        self._bell.ring(self._database, freed)
+        self._housekeeping.start()
+
+    def close(self) -> None:
+        """End the slots: running stages are given back, stage processes are killed."""
+        self.shutdown.set()
+        self._housekeeping.stop(self._settings.cancel_grace_s)
+        self._direct.shutdown(wait=True)
+        for runner in self._runners:
+            runner.close()
+        with self._database.session_scope() as session:
+            forget_worker(session, self.identity.id)
+        self._bell.close()
+        self._database.dispose()
+
+    def serve(self, stage_id: str | None = None) -> None:
+        """Run a stage, if it is free and so is a slot; then whatever else waits for this worker."""
+        try:
+            runner = self._free.get_nowait()
+        except queue.Empty:
+            return  # the database remembers the stage; a slot that ends its work looks there
+        try:
+            claim = self._claim(stage_id) if stage_id else None
+            while not self.shutdown.is_set():
+                claim = claim or self._claim_next()
+                if claim is None:
+                    return
+                ready = runner.run(claim)
+                claim = self._claim_next() if not self.shutdown.is_set() else None
+                taken = claim.stage_id if claim else None
+                self._bell.ring(self._database, [key for key in ready if key != taken])
+        finally:
+            self._free.put(runner)
+
+    def sweep(self) -> None:
+        """Delete the bytes of deleted records now."""
+        self._housekeeping.clean()
+
+    def _register(self) -> None:
+        with self._database.session_scope() as session:
+            register_worker(
+                session,
+                self.identity.id,
+                hostname=socket.gethostname(),
+                pid=os.getpid(),
+                queues=self.identity.queues,
+                slots=self.identity.slots,
+                has_gpu=self.identity.has_gpu,
+            )
+
+    def _claim(self, stage_id: str) -> Claim | None:
+        with self._database.session_scope() as session:
+            return claim_stage(session, stage_id, self.identity.id, self._settings.lease_s)
+
+    def _waiting(self, older_than_s: float) -> list[WaitingStage]:
+        """Ready stages that this worker may take; GPU stages first where it has a GPU."""
+        with self._database.read_scope() as session:
+            waiting = ready_unclaimed(session, older_than_s)
+            gpu_is_live = bool(waiting) and has_live_gpu(session)
+        mine = [
+            stage
+            for stage in waiting
+            if queue_for(stage.needs_gpu, gpu_is_live) in self.identity.queues
+        ]
+        if self.identity.has_gpu:
+            mine.sort(key=lambda stage: not stage.needs_gpu)
+        return mine
+
+    def _claim_next(self) -> Claim | None:
+        for stage in self._waiting(0.0):
+            if claim := self._claim(stage.id):
+                return claim
+        return None
+
+    def _offer(self) -> None:
+        if self._free.empty() or self.shutdown.is_set():
+            return
+        waiting = self._waiting(self._settings.direct_after_s)
+        if waiting:
+            _log.info("taking %s, which nobody came for", waiting[0].id)
+            self._direct.submit(self.serve, waiting[0].id)
+
+
+_current: list[WorkerRuntime] = []
+
+
+def set_current_runtime(runtime: WorkerRuntime) -> None:
+    """Name the runtime of this process, for the Celery tasks."""
+    _current[:] = [runtime]
+
+
+def current_runtime() -> WorkerRuntime:
+    """The runtime of this process. Raises RuntimeError before `set_current_runtime`."""
+    if not _current:
+        raise RuntimeError("this process was not started as `python -m worker`")
+    return _current[0]

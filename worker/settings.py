@@ -1,0 +1,29 @@
+"""How a worker behaves: typed settings from the environment, prefix NERFWORKS_WORKER_."""
+
+from __future__ import annotations
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class WorkerSettings(BaseSettings):
+    """Times in seconds. The lease must outlast several heartbeats."""
+
+    model_config = SettingsConfigDict(env_prefix="NERFWORKS_WORKER_", extra="ignore", frozen=True)
+
+    lease_s: float = Field(60.0, gt=0, description="A claim dies this long after its heartbeat.")
+    heartbeat_s: float = Field(5.0, gt=0, description="Time between two heartbeats.")
+    cancel_poll_s: float = Field(2.0, gt=0, description="Time between two looks for a cancel.")
+    tick_s: float = Field(2.0, gt=0, description="Time between two rounds of housekeeping.")
+    direct_after_s: float = Field(
+        10.0, ge=0, description="A free slot takes a ready stage that waited so long by itself."
+    )
+    ring_again_s: float = Field(
+        60.0,
+        gt=0,
+        description="The bell rings again for a ready stage after so long.",
+    )
+    cancel_grace_s: float = Field(
+        5.0, ge=0, description="A stage that was asked to stop is killed after so long."
+    )
+    transfers: int = Field(4, ge=1, le=64, description="Files moved at once by one slot.")

@@ -1,0 +1,246 @@
+"""The warm child that runs heavy stages; one per slot: `python -m worker.stage_process`.
+
+It reads commands as JSON lines from stdin and writes messages as JSON lines to a descriptor of its
+own; what stages print to stdout and stderr are log lines.
+
+    commands:  {"do": "run", "registry", "stage", "options", "root", "seed", "run_id"}
+               {"do": "cancel", "run_id"}
+    messages:  {"type": "hello", "pid"}
+               {"type": "progress", "fraction", "message", "eta_s"}
+               {"type": "checkpoint", "path", "files": {name: [bytes, mtime_ns]}}
+               {"type": "done", "manifest"} | {"type": "failed", "error"} | {"type": "cancelled"}
+    log line:  END_OF_LOG + run_id after the last line of a run
+
+It never outlives its worker. A guardian, forked before anything heavy is loaded, waits for the end
+of a pipe that only the worker holds open, and then kills the whole process group: also where the
+main thread sits in a long native call and no Python thread can run, and with it the programs that
+a stage started. When the stage process itself ends, the guardian kills what it left behind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import faulthandler
+import gc
+import importlib
+import json
+import logging
+import os
+import queue
+import select
+import shutil
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from pipelines.errors import Cancelled, PipelineError, ResourceError
+from pipelines.manifest import RunHooks, run_stage
+from pipelines.workspace import Workspace
+from worker.locks import folder_lock
+
+END_OF_LOG = "\x01end-of-log "
+GUARDIAN_STEP_S = 0.5
+PROGRESS_STEP_S = 0.25
+PREDECESSOR_TIMEOUT_S = 20.0
+OOM_SCORE = 500
+INTERNAL_HINT = "This is a fault of the service: see the job's logs for the step that failed."
+
+
+def kill_group() -> None:
+    """End this process, its guardian and all that a stage started."""
+    os.killpg(os.getpgrp(), signal.SIGKILL)
+
+
+def start_guardian(life_fd: int, message_fd: int) -> None:
+    """Fork the process that kills the group when the worker, or this process, is gone."""
+    parent = os.getpid()
+    if os.fork() != 0:
+        os.close(life_fd)
+        return
+    os.close(message_fd)
+    null = os.open(os.devnull, os.O_RDWR)
+    for descriptor in (0, 1, 2):
+        os.dup2(null, descriptor)
+    while os.getppid() == parent:
+        readable, _, _ = select.select([life_fd], [], [], GUARDIAN_STEP_S)
+        if readable and not os.read(life_fd, 1):
+            break
+    kill_group()
+
+
+def offer_to_oom_killer() -> None:
+    """When memory runs out, let the kernel end this process and not the worker."""
+    try:
+        Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE))
+    except OSError:
+        return  # not Linux, or not allowed: a preference, no more
+
+
+def error_of(error: BaseException, stage: str) -> dict[str, Any]:
+    """What the API will show of an exception. Foreign texts stay out: they may hold paths."""
+    if isinstance(error, PipelineError):
+        return error.as_dict()
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return ResourceError(
+            f"Memory ran out during {stage}.",
+            code="out_of_memory",
+            hint="Use a smaller preset, or fewer or smaller images, or a larger machine.",
+        ).as_dict()
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return ResourceError(
+            f"The disk is full: {stage} could not write its results.",
+            code="disk_full",
+            hint="Free some space on the worker's disk; then submit the job again.",
+        ).as_dict()
+    return PipelineError(
+        f"The stage {stage} failed with {type(error).__name__}.",
+        code="internal_error",
+        hint=INTERNAL_HINT,
+    ).as_dict()
+
+
+class Messages:
+    """Writes messages to the worker; a worker that is gone ends this process."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._file = os.fdopen(descriptor, "w", encoding="utf-8")
+        self._lock = threading.Lock()
+
+    def send(self, kind: str, **fields: Any) -> None:
+        """Write one message."""
+        line = json.dumps({"type": kind, **fields})
+        with self._lock:
+            try:
+                self._file.write(line + "\n")
+                self._file.flush()
+            except BrokenPipeError:
+                kill_group()
+
+
+class Run:
+    """One run of one stage."""
+
+    def __init__(self, command: dict[str, Any], messages: Messages, cancelled: set[str]) -> None:
+        self._run_id: str = command["run_id"]
+        self._stage_name: str = command["stage"]
+        self._command = command
+        self._messages = messages
+        self._cancelled = cancelled
+        self._workspace = Workspace(Path(command["root"]))
+        self._progress_at = 0.0
+        self._snapshots = 0
+
+    def execute(self) -> None:
+        """Run the stage and send how it ended."""
+        try:
+            with folder_lock(
+                self._workspace.root, f"run-{self._stage_name}", PREDECESSOR_TIMEOUT_S
+            ):
+                manifest = self._run()
+        except Cancelled:
+            ending: tuple[str, dict[str, Any]] = ("cancelled", {})
+        except Exception as error:
+            expected = isinstance(error, PipelineError)
+            logging.getLogger("nerfworks.stage").error(
+                "%s failed: %s", self._stage_name, error, exc_info=not expected
+            )
+            ending = ("failed", {"error": error_of(error, self._stage_name)})
+        else:
+            ending = ("done", {"manifest": manifest})
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os.write(1, f"{END_OF_LOG}{self._run_id}\n".encode())
+        self._messages.send(ending[0], **ending[1])
+
+    def _run(self) -> dict[str, Any]:
+        registry = importlib.import_module(self._command["registry"])
+        return run_stage(
+            registry.get_stage(self._stage_name),
+            self._command["options"],
+            self._workspace,
+            seed=self._command["seed"],
+            hooks=RunHooks(
+                on_progress=self._on_progress,
+                is_cancelled=lambda: self._run_id in self._cancelled,
+                on_checkpoint=self._on_checkpoint,
+            ),
+        )
+
+    def _on_progress(self, fraction: float, message: str, eta_s: float | None) -> None:
+        moment = time.monotonic()
+        if moment - self._progress_at >= PROGRESS_STEP_S or fraction >= 1.0:
+            self._progress_at = moment
+            self._messages.send("progress", fraction=fraction, message=message, eta_s=eta_s)
+
+    def _on_checkpoint(self) -> None:
+        """Hold the state as it is now, by hard links, to upload it while the stage goes on.
+
+        A stage replaces checkpoint files and never writes into old ones; sizes and times are noted
+        so that the worker notices one that does.
+        """
+        source = self._workspace.checkpoint(self._stage_name)
+        self._snapshots += 1
+        target = source.with_name(f"{self._stage_name}.saved-{self._run_id}-{self._snapshots}")
+        shutil.rmtree(target, ignore_errors=True)
+        files: dict[str, list[int]] = {}
+        for path in sorted(source.rglob("*")):
+            if path.is_file():
+                name = path.relative_to(source).as_posix()
+                (target / name).parent.mkdir(parents=True, exist_ok=True)
+                os.link(path, target / name)
+                found = path.stat()
+                files[name] = [found.st_size, found.st_mtime_ns]
+        self._messages.send("checkpoint", path=str(target), files=files)
+
+
+def read_commands(commands: queue.Queue[dict[str, Any]], cancelled: set[str]) -> None:
+    """Take commands from stdin; its end means that the worker is gone."""
+    for line in sys.stdin:
+        command = json.loads(line)
+        if command["do"] == "cancel":
+            cancelled.add(command["run_id"])
+        else:
+            commands.put(command)
+    kill_group()
+
+
+def tidy_memory() -> None:
+    """Give back what the last stage held: the process stays, its caches need not."""
+    gc.collect()
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
+        torch.cuda.empty_cache()
+
+
+def main() -> None:
+    """Serve runs until the worker ends or kills this process."""
+    parser = argparse.ArgumentParser(description="Runs stages for a worker; not for people.")
+    parser.add_argument("--message-fd", type=int, required=True)
+    parser.add_argument("--life-fd", type=int, required=True)
+    arguments = parser.parse_args()
+    start_guardian(arguments.life_fd, arguments.message_fd)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.set_inheritable(arguments.message_fd, False)
+    offer_to_oom_killer()
+    faulthandler.enable()
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s"
+    )
+    messages = Messages(arguments.message_fd)
+    commands: queue.Queue[dict[str, Any]] = queue.Queue()
+    cancelled: set[str] = set()
+    threading.Thread(target=read_commands, args=(commands, cancelled), daemon=True).start()
+    messages.send("hello", pid=os.getpid())
+    while True:
+        command = commands.get()
+        Run(command, messages, cancelled).execute()
+        cancelled.discard(command["run_id"])
+        tidy_memory()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""Moves stage folders between a job's local folder and the object store.
+
+`guard` is called while bytes move; what it raises ends the transfer (a cancel, a lost lease).
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+from pipelines.manifest import file_sha256
+from pipelines.workspace import MANIFEST, Workspace
+from storage.errors import ObjectStoreError
+from storage.objects import ObjectStore
+from storage.queries import StageInput, StageWork
+from worker.locks import folder_lock
+
+Guard = Callable[[], None]
+FETCH_LOCK_S = 3600.0
+
+
+def _run_all(jobs: Iterable[Callable[[], None]], workers: int) -> None:
+    """Run all jobs, several at once. Raises the first error after the others have stopped."""
+    with ThreadPoolExecutor(workers, thread_name_prefix="transfer") as pool:
+        futures = [pool.submit(job) for job in jobs]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            wait(futures)
+            raise
+
+
+def upload_folder(
+    store: ObjectStore, folder: Path, prefix: str, guard: Guard, *, workers: int
+) -> None:
+    """Upload all files below a folder; its manifest, if any, last."""
+
+    def put(name: str) -> Callable[[], None]:
+        def move() -> None:
+            guard()
+            store.put_file(prefix + name, folder / name, lambda count: guard())
+
+        return move
+
+    names = sorted(
+        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
+    )
+    _run_all([put(name) for name in names if name != MANIFEST], workers)
+    if MANIFEST in names:
+        put(MANIFEST)()
+
+
+def download_folder(
+    store: ObjectStore,
+    prefix: str,
+    folder: Path,
+    guard: Guard,
+    *,
+    workers: int,
+    expected: Sequence[Mapping[str, Any]] = (),
+) -> None:
+    """Replace a folder by all objects below a prefix. It appears whole or not at all.
+
+    expected: `{path, sha256}` of files that must be there. Raises ObjectStoreError for others.
+    """
+    temporary = folder.with_name(f".fetch-{folder.name}-{secrets.token_hex(4)}")
+
+    def get(key: str) -> Callable[[], None]:
+        def move() -> None:
+            guard()
+            store.get_file(key, temporary / key.removeprefix(prefix), lambda count: guard())
+
+        return move
+
+    try:
+        temporary.mkdir(parents=True)
+        _run_all([get(key) for key in store.list(prefix)], workers)
+        for item in expected:
+            path = temporary / item["path"]
+            if not path.is_file() or file_sha256(path) != item["sha256"]:
+                raise ObjectStoreError(f"{prefix}{item['path']} is missing or damaged.")
+        shutil.rmtree(folder, ignore_errors=True)
+        temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _is_here(workspace: Workspace, wanted: StageInput) -> bool:
+    try:
+        local: dict[str, Any] = workspace.manifest(wanted.name)
+    except (OSError, ValueError):
+        return False
+    return all(local.get(key) == wanted.manifest.get(key) for key in ("fingerprint", "content"))
+
+
+def fetch_inputs(
+    store: ObjectStore,
+    workspace: Workspace,
+    reads: Iterable[str],
+    work: StageWork,
+    guard: Guard,
+    *,
+    workers: int,
+) -> None:
+    """Bring the folders that a stage reads; those that lie here with the same manifest stay."""
+    for name in reads:
+        wanted = work.inputs.get(name)
+        if wanted is None:
+            continue  # skipped: there is no folder
+        with folder_lock(workspace.root, f"fetch-{name}", FETCH_LOCK_S):
+            if not _is_here(workspace, wanted):
+                download_folder(
+                    store,
+                    wanted.prefix,
+                    workspace.stage(name),
+                    guard,
+                    workers=workers,
+                    expected=wanted.manifest.get("files", []),
+                )
+
+
+def fetch_capture(store: ObjectStore, workspace: Workspace, work: StageWork, guard: Guard) -> None:
+    """Bring the uploaded bytes."""
+    with folder_lock(workspace.root, "fetch-capture", FETCH_LOCK_S):
+        path = workspace.capture_file
+        if not path.is_file() or path.stat().st_size != work.capture_bytes:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            store.get_file(work.capture_key, path, lambda count: guard())
+
+
+def write_job_file(workspace: Workspace, work: StageWork) -> None:
+    """Write what the stages may know of the job."""
+    workspace.root.mkdir(parents=True, exist_ok=True)
+    facts = {"filename": work.filename, "kind": work.kind, "seed": work.seed}
+    temporary = workspace.job_file.with_name(f".job-{secrets.token_hex(4)}.json")
+    try:
+        temporary.write_text(json.dumps(facts), "utf-8")
+        temporary.replace(workspace.job_file)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def restore_checkpoint(
+    store: ObjectStore,
+    workspace: Workspace,
+    stage: str,
+    prefix: str | None,
+    guard: Guard,
+    *,
+    workers: int,
+) -> None:
+    """Make the stage's checkpoint folder hold the last state that was recorded, or nothing.
+
+    What an earlier attempt left here is not trusted: it may have died while it wrote.
+    """
+    folder = workspace.checkpoint(stage)
+    for leftover in folder.parent.glob(f"{stage}*") if folder.parent.is_dir() else ():
+        shutil.rmtree(leftover, ignore_errors=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    if prefix is not None:
+        download_folder(store, prefix, folder, guard, workers=workers)
