@@ -57,8 +57,8 @@ def require_key(
         record = find_api_key(session, key)
         if record is None:
             raise UnauthorizedError("The API key is not valid.")
-        due = is_use_due(record, now(session))
+        key_id, due = record.id, is_use_due(record, now(session))
     if due:
         with services.database.session_scope() as session:
-            touch_api_key(session, record.id)
-    return record.id
+            touch_api_key(session, key_id)
+    return key_id

@@ -16,14 +16,14 @@ import sys
 import tempfile
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from rich.console import Console
 
-from api.cli import print_results, watch_job
-from api.client import Client, NerfworksError, parse_assignments
+from api.cli_display import print_error, print_results, transfer_bar, watch_job
+from api.client import Client, NerfworksError
 from deploy.embedded import Embedded, default_home, free_port
 from deploy.supervisor import StartFailed
+from pipelines.options import OptionsError, parse_assignments
 
 
 class Stopped(Exception):
@@ -49,26 +49,23 @@ def sample_capture(cache: Path, console: Console) -> Path:
 
 def run_job(client: Client, capture: Path, console: Console) -> int:
     """Upload, run, download, show. Returns the process's exit status."""
-    options: dict[str, Any] = parse_assignments(os.environ.get("SET", "").split())
-    with console.status(f"Uploading {capture.name}"):
-        uploaded = client.upload(capture)
-    console.print(f"Capture {uploaded.id}: {uploaded.kind}, {uploaded.bytes / 1e6:.1f} MB")
-    job = client.create_job(uploaded.id, preset=os.environ.get("PRESET") or None, options=options)
-    console.print(f"Job {job.id}: preset {job.preset} ({job.preset_reason})")
+    options = parse_assignments(os.environ.get("SET", "").split())
+    with transfer_bar(console, "upload") as report:
+        uploaded = client.upload(capture, lambda done, total: report(capture.name, done, total))
+    console.print(f"Capture {uploaded.id}: {uploaded.kind}", highlight=False)
+    job = client.create_job(uploaded.id, os.environ.get("PRESET") or None, options)
+    console.print(f"Job {job.id}: preset {job.preset} ({job.preset_reason})", highlight=False)
     job = watch_job(client, job.id, console)
     folder = Path("out") / job.id
     if job.state != "succeeded":
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "logs.txt").write_text("\n".join(client.logs(job.id)), "utf-8")
-        error = job.error
-        console.print(f"[red]The job {job.state}.[/red]", highlight=False)
-        if error is not None:
-            console.print(f"{error.message}\n{error.hint}", highlight=False)
-        console.print(f"Its logs: {folder / 'logs.txt'}")
+        (folder / "logs.txt").write_text("\n".join(client.logs(job.id)) + "\n", "utf-8")
+        print_error(job, console)
+        console.print(f"The job is {job.state}. Its logs: {folder / 'logs.txt'}", highlight=False)
         return 1
-    client.download(job.id, folder)
-    report = json.loads((folder / "report.json").read_text("utf-8"))
-    print_results(job, folder, report, console)
+    with transfer_bar(console, "download") as report:
+        client.download(job.id, folder, progress=report)
+    print_results(job, folder, json.loads((folder / "report.json").read_text("utf-8")), console)
     return 0
 
 
@@ -96,7 +93,7 @@ def main() -> int:
     except (KeyboardInterrupt, Stopped):
         console.print("Stopped: nothing is left running.")
         return 130
-    except (StartFailed, NerfworksError, subprocess.CalledProcessError) as error:
+    except (StartFailed, NerfworksError, OptionsError, subprocess.CalledProcessError) as error:
         console.print(f"[red]The demo failed.[/red] {error}", highlight=False)
         return 1
     finally:

@@ -189,12 +189,12 @@ class Database:
 
     @contextmanager
     def read_scope(self) -> Iterator[Session]:
-        """A session that only reads; on SQLite it never waits for writers."""
+        """A session that only reads; on SQLite it never waits for writers.
+
+        What it loaded can be used after the block.
+        """
         with self._read() as session:
-            try:
-                yield session
-            finally:
-                session.rollback()
+            yield session
 
     def ping(self) -> None:
         """Raise sqlalchemy's error where the database does not answer."""

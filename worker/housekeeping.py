@@ -31,7 +31,6 @@ from storage.queue import Bell
 from worker.settings import WorkerSettings
 
 _log = logging.getLogger("nerfworks.worker")
-CLEAN_STEP_S = 30.0
 
 
 def detect_gpu() -> bool:
@@ -137,6 +136,6 @@ class Housekeeping:
                 shutil.rmtree(self._work_dir / name, ignore_errors=True)
 
     def _clean_by_time(self) -> None:
-        if time.monotonic() - self._cleaned_at >= CLEAN_STEP_S:
+        if time.monotonic() - self._cleaned_at >= self._settings.clean_s:
             self._cleaned_at = time.monotonic()
             self.clean()

@@ -15,6 +15,9 @@ class WorkerSettings(BaseSettings):
     heartbeat_s: float = Field(5.0, gt=0, description="Time between two heartbeats.")
     cancel_poll_s: float = Field(2.0, gt=0, description="Time between two looks for a cancel.")
     tick_s: float = Field(2.0, gt=0, description="Time between two rounds of housekeeping.")
+    clean_s: float = Field(
+        30.0, gt=0, description="Time between two rounds of cleaning up after finished jobs."
+    )
     direct_after_s: float = Field(
         10.0, ge=0, description="A free slot takes a ready stage that waited so long by itself."
     )

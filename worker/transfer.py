@@ -162,7 +162,8 @@ def restore_checkpoint(
     What an earlier attempt left here is not trusted: it may have died while it wrote.
     """
     folder = workspace.checkpoint(stage)
-    for leftover in folder.parent.glob(f"{stage}*") if folder.parent.is_dir() else ():
+    shutil.rmtree(folder, ignore_errors=True)
+    for leftover in list(folder.parent.glob(f"{stage}.saved-*")):
         shutil.rmtree(leftover, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     if prefix is not None:

@@ -36,7 +36,7 @@ def published(job: Job) -> Iterator[Published]:
         row = rows.get(stage.name)
         if row is None or row.state != "succeeded" or not row.output_prefix or not row.manifest:
             continue
-        files = row.manifest.get("files", {})
+        files = {entry["path"]: entry for entry in row.manifest["files"]}
         for artifact in stage.artifacts:
             entry = files.get(artifact.path)
             if entry is not None:

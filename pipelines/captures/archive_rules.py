@@ -125,7 +125,7 @@ def _check_sizes(entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> N
 def _check_overlap(archive: zipfile.ZipFile, entries: Sequence[zipfile.ZipInfo]) -> None:
     """No two entries share bytes: a bomb can otherwise pack one payload under many names."""
     ordered = sorted(entries, key=lambda info: info.header_offset)
-    starts = [info.header_offset for info in ordered[1:]] + [archive.start_dir]
+    starts = [*(info.header_offset for info in ordered), archive.start_dir][1:]
     for info, next_start in zip(ordered, starts, strict=True):
         end = info.header_offset + _LOCAL_HEADER_BYTES + info.compress_size
         if end > next_start:
@@ -141,6 +141,14 @@ def _check_duplicates(entries: Sequence[zipfile.ZipInfo]) -> None:
         if info.filename in seen:
             raise _unsafe(f'The archive has two entries of one name: "{shown(info.filename)}".')
         seen.add(info.filename)
+
+
+def open_archive(path: Path) -> zipfile.ZipFile:
+    """Open a zip for reading; nothing in it is checked yet. Raises CaptureError archive_damaged."""
+    try:
+        return zipfile.ZipFile(path)
+    except READ_ERRORS as error:
+        raise damaged() from error
 
 
 def checked_entries(archive: zipfile.ZipFile, limits: ArchiveLimits) -> dict[str, zipfile.ZipInfo]:

@@ -9,7 +9,6 @@ Kinds: `video`; `images` (a zip of photos); `nerfstudio` (a zip with `transforms
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,8 +17,8 @@ from typing import Any
 from pipelines.captures.archive_rules import (
     ArchiveLimits,
     checked_entries,
-    damaged,
     head_of,
+    open_archive,
 )
 from pipelines.captures.magic import (
     HEAD_BYTES,
@@ -29,6 +28,8 @@ from pipelines.captures.magic import (
     video_container,
 )
 from pipelines.errors import CaptureError
+
+__all__ = ["KINDS", "ArchiveLimits", "Layout", "Sniffed", "layout_of", "sniff"]
 
 KINDS = ("video", "images", "nerfstudio", "polycam", "record3d")
 _ACCEPTED = "Send a video (MP4, MOV, MKV, WebM, AVI), a .zip of photos, or a .zip of an app export."
@@ -95,12 +96,9 @@ def _unknown(head: bytes, filename: str) -> CaptureError:
 
 
 def _sniff_zip(path: Path, limits: ArchiveLimits) -> Sniffed:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = checked_entries(archive, limits)
-            heads = {name: head_of(archive, info) for name, info in entries.items()}
-    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-        raise damaged() from error
+    with open_archive(path) as archive:
+        entries = checked_entries(archive, limits)
+        heads = {name: head_of(archive, info) for name, info in entries.items()}
     images = [name for name, head in heads.items() if image_format(head)]
     layout = layout_of(entries, images)
     if not images:

@@ -18,6 +18,7 @@ from pipelines.captures.archive_rules import (
     checked_entries,
     damaged,
     head_of,
+    open_archive,
     shown,
 )
 from pipelines.captures.magic import image_format
@@ -36,10 +37,7 @@ class CaptureArchive:
     def __init__(self, path: Path, limits: ArchiveLimits) -> None:
         self._limits = limits
         self._unpacked_bytes = 0
-        try:
-            self._zip = zipfile.ZipFile(path)
-        except READ_ERRORS as error:
-            raise damaged() from error
+        self._zip = open_archive(path)
         try:
             self._entries = checked_entries(self._zip, limits)
             self._formats = {

@@ -130,7 +130,7 @@ class NerfactoField(nn.Module):
         if codes is not None:
             per_ray = per_ray + torch.nn.functional.linear(codes, first.weight[:, stop:])
         hidden = torch.nn.functional.linear(geometry, first.weight[:, start:stop])
-        return torch.sigmoid(self.color_mlp.tail(hidden + per_ray[:, None, :])).float()
+        return torch.sigmoid(self.color_mlp.tail(hidden + per_ray[:, None, :]))
 
     def codes(self, camera_indices: Tensor) -> Tensor | None:
         """The appearance codes [R, A] of training images, or None where there are none."""

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 
 from pipelines.options import PosesOptions
 from pipelines.sfm.pairs import Pairs, exhaustive_pairs, plan_pairs
-from pipelines.sfm.report import Attempt, Outcome, check_features, only_rotates
+from pipelines.sfm.report import Attempt, Outcome, check_features
 from pipelines.sfm.source import Source, camera_groups
+from pipelines.sfm.turning import is_turning
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import MapperSettings, Reconstructor, Watch
 
@@ -131,7 +132,8 @@ class Ladder:
         self._attempts: list[Attempt] = []
 
     def climb(self) -> Outcome:
-        """Run attempts until enough images are registered, or none is left.
+        """Run attempts until enough images are registered, or none is left; none at all where the
+        camera only turned, since no model of it means anything.
 
         Raises PosesError (no_features) before matching where images hold nothing to match.
         """
@@ -143,10 +145,10 @@ class Ladder:
         self._extract()
         check_features(self._reconstructor.statistics(), options)
         self._match(matcher, pairs, _MATCHING)
+        if is_turning(self._reconstructor.statistics()):
+            return Outcome((), self._reconstructor.statistics())
         self._map(matcher, _MAPPING, relaxed=False)
-        hopeless = only_rotates(self._reconstructor.statistics())
-        may_retry = matcher != "exhaustive" and num <= MAX_RETRY_IMAGES and not hopeless
-        if not self._is_enough() and may_retry:
+        if not self._is_enough() and matcher != "exhaustive" and num <= MAX_RETRY_IMAGES:
             matcher = "exhaustive"
             self._progress.aim(_RETRY_MATCHING[0], _RETRY_MAPPING[1])
             self._match(matcher, exhaustive_pairs(num), _RETRY_MATCHING)

@@ -10,7 +10,8 @@ from typing import Any
 from pipelines.errors import PosesError
 from pipelines.options import PosesOptions
 from pipelines.sfm.source import Source
-from pipelines.tools.colmap import PairStatistics, SparseModel, best_model
+from pipelines.sfm.turning import is_turning
+from pipelines.tools.colmap_results import PairStatistics, SparseModel, best_model
 
 MIN_FEATURES = 100
 """An image with fewer features cannot be placed."""
@@ -19,9 +20,6 @@ MIN_INLIERS = 30
 abs_pose_min_num_inliers)."""
 MIN_ANGLE_DEG = 2.0
 """Median triangulation angle below which depth is not determined; COLMAP drops points < 1.5."""
-MAX_ROTATION_SHARE = 0.7
-"""Share of verified pairs that a rotation explains, above which the camera did not travel."""
-
 _MOVE_HINT = (
     "Move sideways around the subject while filming: turning on the spot, or holding still, "
     "shows nothing of depth."
@@ -50,21 +48,16 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All attempts on a capture, at least one, and what matching found."""
+    """All attempts on a capture (none where the camera only turned), and what matching found."""
 
     attempts: tuple[Attempt, ...]
     statistics: PairStatistics
 
     @property
     def chosen(self) -> Attempt:
-        """The attempt that placed most images; the earliest among equals."""
-        return max(self.attempts, key=lambda attempt: attempt.num_registered)
-
-
-def only_rotates(statistics: PairStatistics) -> bool:
-    """Whether matching worked, and pure rotation explains nearly all of what matched."""
-    enough = statistics.num_verified >= 0.5 * len(statistics.num_features)
-    return enough and (statistics.num_rotation_only > MAX_ROTATION_SHARE * statistics.num_verified)
+        """The attempt that placed most images, the earliest among equals; empty without any."""
+        nothing = Attempt(matcher="", relaxed=False, models=(), seconds=0.0)
+        return max(self.attempts, key=lambda attempt: attempt.num_registered, default=nothing)
 
 
 def num_needed(num_images: int, options: PosesOptions) -> int:
@@ -96,6 +89,14 @@ def check_usable(outcome: Outcome, source: Source, options: PosesOptions) -> Spa
     placed = 0 if model is None else len(model.indices)
     needed = num_needed(num, options)
     details: dict[str, Any] = {"num_images": num, "num_registered": placed, "num_needed": needed}
+    if is_turning(outcome.statistics):
+        raise PosesError(
+            "The camera turned or stood still instead of moving: pictures differ only as they do "
+            "from one place.",
+            code="no_parallax",
+            hint=_MOVE_HINT,
+            details=details,
+        )
     if model is not None and placed >= needed:
         if model.angle_deg >= MIN_ANGLE_DEG:
             return model
@@ -105,14 +106,6 @@ def check_usable(outcome: Outcome, source: Source, options: PosesOptions) -> Spa
             code="no_parallax",
             hint=_MOVE_HINT,
             details=details | {"angle_deg": model.angle_deg},
-        )
-    if only_rotates(outcome.statistics):
-        raise PosesError(
-            f"The camera turned or stood still instead of moving: {placed} of {num} "
-            f"{_noun(source)} registered.",
-            code="no_parallax",
-            hint=_MOVE_HINT,
-            details=details,
         )
     reasons = Counter(entry["code"] for entry in unregistered_images(outcome, source))
     raise PosesError(
@@ -205,7 +198,7 @@ def build_report(
         "matching": {
             "num_pairs": statistics.num_pairs,
             "num_verified": statistics.num_verified,
-            "num_rotation_only": statistics.num_rotation_only,
+            "num_one_homography": len(statistics.homographies),
             "mean_features": float(statistics.num_features.mean()),
         },
         "world": world,

@@ -40,7 +40,7 @@ class Source:
 
 
 def read_source(workspace: Workspace) -> Source:
-    """The images of a job: of frames.json for a video, of the ingest folder for photos.
+    """The images of a job: of frames.json for a video, of capture.json for photos.
 
     Raises CaptureError (no_images, too_few_images) where there are none, or one.
     """
@@ -52,9 +52,8 @@ def read_source(workspace: Workspace) -> Source:
         times = tuple(float(frame["timestamp_s"]) for frame in frames)
         source = Source(root, files, times, is_video=True)
     else:
-        folder = root / "images"
-        found = sorted(path for path in folder.rglob("*") if path.is_file())
-        files = tuple(path.relative_to(root).as_posix() for path in found)
+        capture = json.loads((root / "capture.json").read_text("utf-8"))
+        files = tuple(str(image["file"]) for image in capture["images"])
         source = Source(root, files, (None,) * len(files), is_video=False)
     missing = [file for file in source.files if not (root / file).is_file()]
     if not source.files or missing:

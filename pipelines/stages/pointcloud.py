@@ -1,8 +1,8 @@
 """The point cloud stage: points with colour and normals from the depth of training views.
 
-Reads `train/model.zip`, writes `pointcloud.ply` in the world frame of cameras.json. Views are spread
-over the capture and just large enough for the points wanted, so the work is known beforehand and
-an empty crop ends in an error instead of a search without end.
+Reads `train/model.zip`, writes `pointcloud.ply` in the world frame of cameras.json. Views are
+spread over the capture and just large enough for the points wanted, so the work is known beforehand
+and an empty crop ends in an error instead of a search without end.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ from pipelines.sfm.attempts import Checkpoint, Ladder
 from pipelines.sfm.report import build_report, check_usable
 from pipelines.sfm.source import Source, read_source
 from pipelines.stage import StageContext
-from pipelines.tools.colmap import Reconstructor, SparseModel
+from pipelines.tools.colmap import Reconstructor
+from pipelines.tools.colmap_results import SparseModel
 
 MIN_TRACK = 3
 """Points seen by fewer images are left out of points.ply: most of them are wrong."""

@@ -1,9 +1,9 @@
 """The train stage: fit the model to the posed images.
 
-Reads `cameras.json` of `poses` or `ingest` and the images beside it. Writes `model.zip` (all that is
-needed to render again without the capture), `cameras.json` (world frame; training cameras as
-training corrected them, held-out ones as they came) and `previews/`, pictures of a held-out view
-as training goes on. Goes on from its checkpoint after a failed attempt.
+Reads `cameras.json` of `poses` or `ingest` and the images beside it. Writes `model.zip` (all that
+is needed to render again without the capture), `cameras.json` (world frame; training cameras as
+training corrected them, held-out ones as they came) and `previews/`, pictures of a held-out view as
+training goes on. Goes on from its checkpoint after a failed attempt.
 """
 
 from __future__ import annotations

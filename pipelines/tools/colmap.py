@@ -16,21 +16,22 @@ Axes here are COLMAP's: cameras look along +Z, +Y down. Pixel centres lie at (0.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import sqlite3
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import pycolmap
 
-from pipelines.cameras_file import Intrinsics
 from pipelines.errors import ToolError
+from pipelines.tools.colmap_results import (
+    PairStatistics,
+    SparseModel,
+    read_statistics,
+    sparse_model,
+)
 
 Watch = Callable[[int], None]
 """Called every half second with the number of items done; what it raises ends the call."""
@@ -40,24 +41,6 @@ _IMAGE_PORTION = 16
 _PAIR_TILE = 12
 """Pairs are taken in tiles of 12 x 12 images, whose features then stay in memory."""
 _PAIR_PORTION = 144
-_ANGLE_SAMPLE = 3000
-
-LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
-    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
-}
-"""The order of COLMAP's parameters (src/colmap/sensor/models.h); `f` is both focal lengths."""
-
-_ROTATION_ONLY = (
-    int(pycolmap.TwoViewGeometryConfiguration.PANORAMIC),
-    int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC),
-)
 
 
 @dataclass(frozen=True)
@@ -75,72 +58,6 @@ class MapperSettings:
     refine_focal: bool = True
     refine_principal_point: bool = False
     relaxed: bool = False
-
-
-@dataclass(frozen=True)
-class PairStatistics:
-    """What matching found.
-
-    num_features: [N] int, per image. best_inliers: [N] int, verified matches with the image's best
-    partner. num_pairs: pairs compared. num_verified: pairs with a verified geometry.
-    num_rotation_only: verified pairs that a pure rotation (or one plane) explains.
-    """
-
-    num_features: npt.NDArray[np.int64]
-    best_inliers: npt.NDArray[np.int64]
-    num_pairs: int
-    num_verified: int
-    num_rotation_only: int
-
-
-@dataclass(frozen=True)
-class SparseModel:
-    """One reconstruction, in its own arbitrary frame and scale.
-
-    indices: [N], the images it holds, ascending. cameras: lenses in use.
-    camera_of: [N], index into `cameras`. world_from_camera: [N, 3, 4] float64, OpenCV axes.
-    points: [P, 3] float64. colors: [P, 3] uint8. track_lengths: [P], images that see each point.
-    error_px: mean reprojection error. angle_deg: median over points of the widest angle between
-    two of its rays; small where the camera hardly moved.
-    """
-
-    indices: tuple[int, ...]
-    cameras: tuple[Intrinsics, ...]
-    camera_of: tuple[int, ...]
-    world_from_camera: npt.NDArray[np.float64]
-    points: npt.NDArray[np.float64]
-    colors: npt.NDArray[np.uint8]
-    track_lengths: npt.NDArray[np.int64]
-    error_px: float
-    angle_deg: float
-
-
-def best_model(models: Sequence[SparseModel]) -> SparseModel | None:
-    """The model with most images, then most points; None where there is none.
-
-    COLMAP's first model is often a spurious one of a few images: its order says nothing.
-    """
-    return max(models, key=lambda model: (len(model.indices), len(model.points)), default=None)
-
-
-def intrinsics_from_colmap(
-    model: str, width: int, height: int, params: Sequence[float]
-) -> Intrinsics:
-    """A COLMAP camera as ours. Raises ToolError for a lens model that we cannot express."""
-    names = LENS_PARAMETERS.get(model)
-    if names is None or len(names) != len(params):
-        raise ToolError(
-            f"COLMAP returned a camera of model {model}, which is not supported.",
-            hint=f"Choose one of {', '.join(sorted(LENS_PARAMETERS))}.",
-        )
-    values = {name: float(value) for name, value in zip(names, params, strict=True)}
-    focal = values.pop("f", None)
-    if focal is not None:
-        values |= {"fl_x": focal, "fl_y": focal}
-    ours = "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV"
-    if model.endswith("PINHOLE"):
-        ours = "PINHOLE"
-    return Intrinsics(width=width, height=height, model=ours, **values)
 
 
 class Reconstructor:
@@ -278,30 +195,7 @@ class Reconstructor:
 
     def statistics(self) -> PairStatistics:
         """What extraction and matching put into the database. Not while another call runs."""
-        num_features = np.zeros(len(self.names), np.int64)
-        best = np.zeros(len(self.names), np.int64)
-        with contextlib.closing(sqlite3.connect(self.database)) as connection:
-            index_of = {
-                image_id: image_index(name)
-                for image_id, name in connection.execute("SELECT image_id, name FROM images")
-            }
-            for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints"):
-                num_features[index_of[image_id]] = rows
-            pairs = connection.execute(
-                "SELECT pair_id, rows, config FROM two_view_geometries"
-            ).fetchall()
-        verified = [pair for pair in pairs if pair[1] > 0]
-        for pair_id, rows, _ in verified:
-            for image_id in pycolmap.pair_id_to_image_pair(pair_id):
-                index = index_of[image_id]
-                best[index] = max(best[index], rows)
-        return PairStatistics(
-            num_features=num_features,
-            best_inliers=best,
-            num_pairs=len(pairs),
-            num_verified=len(verified),
-            num_rotation_only=sum(config in _ROTATION_ONLY for _, _, config in verified),
-        )
+        return read_statistics(self.database, len(self.names))
 
     def _mapping_options(self, settings: MapperSettings) -> Any:
         options = pycolmap.IncrementalPipelineOptions()
@@ -348,50 +242,3 @@ class Reconstructor:
                 f"COLMAP failed while {what} of {len(self.names)} images.",
                 details={"log": str(error)[-2000:]},
             ) from error
-
-
-def image_index(name: str) -> int:
-    """The index that an image's name in the database stands for."""
-    return int(Path(name).stem)
-
-
-def sparse_model(reconstruction: Any) -> SparseModel:
-    """A `pycolmap.Reconstruction` as plain arrays."""
-    images = sorted(
-        (reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()),
-        key=lambda image: image_index(image.name),
-    )
-    camera_ids = sorted({image.camera_id for image in images})
-    cameras = [reconstruction.camera(camera_id) for camera_id in camera_ids]
-    poses = np.stack([image.cam_from_world().inverse().matrix() for image in images])
-    points = list(reconstruction.points3D.values())
-    center_of = {image.image_id: pose[:, 3] for image, pose in zip(images, poses, strict=True)}
-    return SparseModel(
-        indices=tuple(image_index(image.name) for image in images),
-        cameras=tuple(
-            intrinsics_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
-            for camera in cameras
-        ),
-        camera_of=tuple(camera_ids.index(image.camera_id) for image in images),
-        world_from_camera=poses,
-        points=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        track_lengths=np.array([point.track.length() for point in points], np.int64),
-        error_px=float(reconstruction.compute_mean_reprojection_error()),
-        angle_deg=_median_widest_angle_deg(points, center_of),
-    )
-
-
-def _median_widest_angle_deg(
-    points: Sequence[Any], center_of: dict[int, npt.NDArray[np.float64]]
-) -> float:
-    """The median over (at most 3,000) points of the widest angle between their rays, degrees."""
-    if not points:
-        return 0.0
-    widest: list[float] = []
-    for point in points[:: max(1, len(points) // _ANGLE_SAMPLE)]:
-        centers = np.array([center_of[element.image_id] for element in point.track.elements])
-        rays = point.xyz - centers
-        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        widest.append(float(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
-    return float(np.degrees(np.median(widest)))

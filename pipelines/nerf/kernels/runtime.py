@@ -26,6 +26,13 @@ import torch
 
 # Everything but the promise that there are no NaN: a diverged training must show, not hide.
 FAST_MATH = {"contract", "reassoc", "nsz", "arcp", "afn"}
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "fastmath": FAST_MATH,
+    "nogil": True,
+    "error_model": "numpy",
+    "boundscheck": False,
+}
 
 
 def _cache_folder() -> Path:
@@ -57,9 +64,12 @@ numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
 
 def compiled(function: Callable[..., Any]) -> Any:
     """A kernel, or a function for use inside kernels: cached, without the interpreter's lock."""
-    return numba.njit(
-        cache=True, fastmath=FAST_MATH, nogil=True, error_model="numpy", boundscheck=False
-    )(function)
+    return numba.njit(**_OPTIONS)(function)
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """A small function for the innermost loops, where a call would cost more than its body."""
+    return numba.njit(forceinline=True, **_OPTIONS)(function)
 
 
 def num_threads() -> int:

@@ -23,12 +23,18 @@ def frame(index: int) -> np.ndarray:
     return picture
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("video") / "video.mp4"
+def record(path: Path, cancel: bool = False) -> None:
     with VideoWriter(path, WIDTH, HEIGHT, 24.0, 18) as writer:
         for index in range(FRAMES):
             writer.write(frame(index))
+        if cancel:
+            raise Cancelled("The job was cancelled.")
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "video.mp4"
+    record(path)
     return path
 
 
@@ -54,23 +60,15 @@ def test_colors_survive(video: Path) -> None:
 
 def test_a_cancel_in_the_middle_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "video.mp4"
-    with (
-        pytest.raises(Cancelled),
-        VideoWriter(path, WIDTH, HEIGHT, 24.0, 18) as writer,
-    ):
-        writer.write(frame(0))
-        raise Cancelled("The job was cancelled.")
+    with pytest.raises(Cancelled):
+        record(path, cancel=True)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_failing_ffmpeg_is_an_error_with_its_last_lines(tmp_path: Path) -> None:
     path = tmp_path / "no" / "such" / "folder" / "video.mp4"
-    with (
-        pytest.raises(ToolError, match="ffmpeg") as caught,
-        VideoWriter(path, WIDTH, HEIGHT, 24.0, 18) as writer,
-    ):
-        for index in range(FRAMES):
-            writer.write(frame(index))
+    with pytest.raises(ToolError, match="ffmpeg") as caught:
+        record(path)
     assert any("No such file" in line for line in caught.value.details["log"])
     assert str(tmp_path) not in caught.value.message
 

@@ -16,9 +16,7 @@ def _histogram(rays: int, num: int, seed: int) -> tuple[torch.Tensor, torch.Tens
     return edges, weights / weights.sum(-1, keepdim=True)
 
 
-def _overlap_loop(
-    edges: torch.Tensor, other: torch.Tensor, weights: torch.Tensor
-) -> torch.Tensor:
+def _overlap_loop(edges: torch.Tensor, other: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     covers = torch.zeros(edges.shape[0], edges.shape[1] - 1, dtype=torch.float64)
     for ray in range(edges.shape[0]):
         for i in range(edges.shape[1] - 1):

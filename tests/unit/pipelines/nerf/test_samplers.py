@@ -63,9 +63,7 @@ def test_proposals_gather_the_samples_at_a_surface() -> None:
     assert final.num_samples == 32
     near_wall = (final.t_mid > 1.8) & (final.t_mid < 2.5)
     assert float(near_wall.float().mean()) > 0.4
-    flat, _, _ = sample_proposals(
-        _rays(3), [wall, wall], (128, 64), 32, 0.05, 100.0, exponent=0.0
-    )
+    flat, _, _ = sample_proposals(_rays(3), [wall, wall], (128, 64), 32, 0.05, 100.0, exponent=0.0)
     assert float(((flat.t_mid > 1.8) & (flat.t_mid < 2.5)).float().mean()) < 0.2
 
 

@@ -1,0 +1,280 @@
+"""The `nerfworks` command: a thin layer over the client.
+
+    nerfworks up                      keep the service running from this folder
+    nerfworks submit FILE             upload, start a job; --wait and --download go on to the end
+    nerfworks status | watch | logs | download [JOB]     the newest job where none is named
+    nerfworks cancel | delete JOB
+    nerfworks list | presets
+
+Exit status: 0 done, 1 the job failed or the call was refused, 2 wrong usage, 3 no service reached.
+Ctrl-C while watching leaves the job running.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from api.cli_display import (
+    clean,
+    print_error,
+    print_job,
+    print_jobs,
+    print_results,
+    transfer_bar,
+    watch_job,
+)
+from api.client import ApiProblem, Client, ConnectionFailed, Job, JobFailed, NerfworksError
+
+__all__ = ["main", "print_results", "watch_job"]
+
+OK, FAILED, USAGE, UNREACHABLE = 0, 1, 2, 3
+INTERRUPTED = 130
+
+
+class UsageError(Exception):
+    """The command line is wrong in a way that argparse does not see."""
+
+
+def _options(assignments: list[str]) -> dict[str, Any]:
+    from pipelines.options import OptionsError, parse_assignments
+
+    try:
+        return parse_assignments(assignments)
+    except OptionsError as error:
+        raise UsageError(f"--set: {error}") from error
+
+
+def _labels(assignments: list[str]) -> dict[str, str]:
+    labels = {}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise UsageError(f"--label {text}: expected key=value")
+        labels[key] = value
+    return labels
+
+
+def _job_of(client: Client, args: argparse.Namespace) -> str:
+    """The job that was named, else the newest. Raises NerfworksError where there is none."""
+    if args.job is not None:
+        return str(args.job)
+    for job in client.jobs():
+        return job.id
+    raise NerfworksError("There is no job yet.", "Start one: nerfworks submit FILE")
+
+
+def _download(client: Client, job_id: str, folder: Path, console: Console) -> list[Path]:
+    with transfer_bar(console, "download") as report:
+        return client.download(job_id, folder, progress=report)
+
+
+def _finish(client: Client, job: Job, folder: Path | None, console: Console) -> int:
+    """After watching: download and show, or say why not."""
+    if job.state != "succeeded":
+        if job.error is None:
+            console.print(f"The job is {job.state}.")
+        print_error(job, console)
+        return FAILED
+    if folder is None:
+        console.print(f"Job {job.id} succeeded. Get its files: nerfworks download {job.id}")
+        return OK
+    _download(client, job.id, folder, console)
+    report = folder / "report.json"
+    loaded = json.loads(report.read_text("utf-8")) if report.is_file() else {}
+    print_results(job, folder, loaded, console)
+    return OK
+
+
+def _watch(client: Client, job_id: str, folder: Path | None, console: Console) -> int:
+    try:
+        job = watch_job(client, job_id, console)
+    except KeyboardInterrupt:
+        console.print(f"\nThe job goes on. See it again: nerfworks watch {job_id}")
+        return INTERRUPTED
+    return _finish(client, job, folder, console)
+
+
+def submit(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Upload a capture and start a job."""
+    options, labels = _options(args.set), _labels(args.label)
+    path = Path(args.file)
+    if not path.is_file():
+        raise UsageError(f"There is no file {args.file}.")
+    with transfer_bar(console, "upload") as report:
+        capture = client.upload(path, lambda done, total: report(path.name, done, total))
+    console.print(f"Capture {capture.id}: {clean(capture.kind)}", highlight=False)
+    job = client.create_job(capture.id, args.preset, options, labels)
+    console.print(
+        f"Job {job.id}: preset {job.preset} ({clean(job.preset_reason)})", highlight=False
+    )
+    if args.wait or args.download is not None:
+        folder = None if args.download is None else Path(args.download)
+        return _watch(client, job.id, folder, console)
+    console.print(f"See it: nerfworks watch {job.id}", highlight=False)
+    return OK
+
+
+def status(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Show a job as it stands."""
+    job = client.get_job(_job_of(client, args))
+    print_job(job, console)
+    return FAILED if job.state == "failed" else OK
+
+
+def watch(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Show a job until it is over."""
+    return _watch(client, _job_of(client, args), None, console)
+
+
+def logs(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Print a job's log; with --follow until the job is over."""
+    job_id, line = _job_of(client, args), args.line
+
+    def show() -> None:
+        nonlocal line
+        while True:
+            page = client.log_page(job_id, args.stage, line)
+            for text in page.lines:
+                console.print(clean(text), highlight=False, soft_wrap=True)
+            line = page.next
+            if not page.lines or page.next >= page.total:
+                return
+
+    show()
+    if args.follow:
+        client.wait(job_id, on_update=lambda _: show())
+        show()
+    return OK
+
+
+def download(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Download what a job offers."""
+    job_id = _job_of(client, args)
+    folder = Path("out") / job_id if args.folder is None else Path(args.folder)
+    for path in _download(client, job_id, folder, console):
+        console.print(clean(str(path)), highlight=False, soft_wrap=True)
+    return OK
+
+
+def cancel(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Ask a job to stop."""
+    console.print(f"The job is {client.cancel(args.job).state}.")
+    return OK
+
+
+def delete(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Delete a job and its bytes."""
+    client.delete_job(args.job)
+    console.print("Deleted.")
+    return OK
+
+
+def list_jobs(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """A table of jobs, newest first."""
+    found = []
+    for job in client.jobs(state=args.state, label=args.label):
+        found.append(job)
+        if len(found) >= args.limit:
+            break
+    print_jobs(found, console)
+    return OK
+
+
+def presets(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """The presets of the service."""
+    del args
+    found = client.presets()
+    for preset in found.items:
+        mark = f" (the default: {found.default_reason})" if preset.name == found.default else ""
+        console.print(f"{preset.name:<10} {clean(preset.summary + mark)}", highlight=False)
+    return OK
+
+
+def _up(arguments: list[str]) -> int:
+    from deploy import local
+
+    return local.main(arguments)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nerfworks", description="A phone capture in; a mesh, a point cloud and a video out."
+    )
+    parser.add_argument("--url", help="the service; else NERFWORKS_URL, else this folder's")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Callable[..., int], job: str = "") -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=(run.__doc__ or "").strip().rstrip("."))
+        added.set_defaults(run=run)
+        if job == "newest":
+            added.add_argument("job", nargs="?", metavar="JOB", help="left out: the newest")
+        elif job == "named":
+            added.add_argument("job", metavar="JOB")
+        return added
+
+    commands.add_parser("up", help="Keep the service running from this folder", add_help=False)
+    one = command("submit", submit)
+    one.add_argument("file", metavar="FILE", help="a video, or a .zip of photos or an app export")
+    one.add_argument("--preset", help="preview, standard or high; else the service chooses")
+    one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
+    one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
+    one.add_argument("--wait", action="store_true", help="show the job until it is over")
+    one.add_argument("--download", metavar="DIR", help="wait, then download the results there")
+    command("status", status, "newest")
+    command("watch", watch, "newest")
+    one = command("logs", logs, "newest")
+    one.add_argument("--stage", help="only this stage")
+    one.add_argument("--line", type=int, default=0, help="from this line on; negative: the tail")
+    one.add_argument("--follow", action="store_true", help="go on until the job is over")
+    command("download", download, "newest").add_argument("folder", nargs="?", metavar="DIR")
+    command("cancel", cancel, "named")
+    command("delete", delete, "named")
+    one = command("list", list_jobs)
+    one.add_argument("--state", help="only jobs in this state")
+    one.add_argument("--label", metavar="KEY[=VALUE]", help="only jobs with this label")
+    one.add_argument("--limit", type=int, default=50, help="at most so many")
+    command("presets", presets)
+    return parser
+
+
+def _say(errors: Console, error: NerfworksError) -> None:
+    errors.print(f"[red]{clean(error.message)}[/red]", highlight=False, soft_wrap=True)
+    if isinstance(error, ApiProblem):
+        for path, detail in error.errors:
+            errors.print(f"  {clean(path)}: {clean(detail)}", highlight=False, soft_wrap=True)
+    if error.hint:
+        errors.print(clean(error.hint), highlight=False, soft_wrap=True)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command. Returns the process's exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["up"]:
+        return _up(given[1:])
+    args = _parser().parse_args(given)
+    console, errors = Console(), Console(stderr=True)
+    try:
+        with Client(args.url) as client:
+            status_code: int = args.run(client, args, console)
+            return status_code
+    except UsageError as error:
+        errors.print(clean(str(error)), highlight=False, soft_wrap=True)
+        return USAGE
+    except ConnectionFailed as error:
+        _say(errors, error)
+        return UNREACHABLE
+    except (ApiProblem, JobFailed, NerfworksError) as error:
+        _say(errors, error)
+        return FAILED
+    except OSError as error:
+        errors.print(clean(f"{error.filename or 'A file'}: {error.strerror}"), highlight=False)
+        return FAILED
+    except KeyboardInterrupt:
+        return INTERRUPTED

@@ -1,0 +1,201 @@
+"""What COLMAP found, as plain arrays: matches from its database, models from its reconstructions.
+
+Axes are COLMAP's: cameras look along +Z, +Y down. Pixel centres lie at (0.5, 0.5), as ours.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from pipelines.cameras_file import Intrinsics
+from pipelines.errors import ToolError
+
+_ANGLE_SAMPLE = 3000
+
+LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+}
+"""The order of COLMAP's parameters (src/colmap/sensor/models.h); `f` is both focal lengths."""
+
+_ONE_HOMOGRAPHY = (
+    int(pycolmap.TwoViewGeometryConfiguration.PLANAR),
+    int(pycolmap.TwoViewGeometryConfiguration.PANORAMIC),
+    int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC),
+)
+
+
+@dataclass(frozen=True)
+class PairStatistics:
+    """What matching found.
+
+    num_features: [N] int, per image. best_inliers: [N] int, verified matches with the image's best
+    partner. num_pairs: pairs compared. num_verified: pairs with a verified geometry.
+    homographies: [H, 3, 3], of the verified pairs that one homography explains (a turning camera,
+    or one plane), in units of the image's long side from its centre, x right, y down.
+    """
+
+    num_features: npt.NDArray[np.int64]
+    best_inliers: npt.NDArray[np.int64]
+    num_pairs: int
+    num_verified: int
+    homographies: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """One reconstruction, in its own arbitrary frame and scale.
+
+    indices: [N], the images it holds, ascending. cameras: lenses in use.
+    camera_of: [N], index into `cameras`. world_from_camera: [N, 3, 4] float64, OpenCV axes.
+    points: [P, 3] float64. colors: [P, 3] uint8. track_lengths: [P], images that see each point.
+    error_px: mean reprojection error. angle_deg: median over points of the widest angle between
+    two of its rays; small where the camera hardly moved.
+    """
+
+    indices: tuple[int, ...]
+    cameras: tuple[Intrinsics, ...]
+    camera_of: tuple[int, ...]
+    world_from_camera: npt.NDArray[np.float64]
+    points: npt.NDArray[np.float64]
+    colors: npt.NDArray[np.uint8]
+    track_lengths: npt.NDArray[np.int64]
+    error_px: float
+    angle_deg: float
+
+
+def best_model(models: Sequence[SparseModel]) -> SparseModel | None:
+    """The model with most images, then most points; None where there is none.
+
+    COLMAP's first model is often a spurious one of a few images: its order says nothing.
+    """
+    return max(models, key=lambda model: (len(model.indices), len(model.points)), default=None)
+
+
+def intrinsics_from_colmap(
+    model: str, width: int, height: int, params: Sequence[float]
+) -> Intrinsics:
+    """A COLMAP camera as ours. Raises ToolError for a lens model that we cannot express."""
+    names = LENS_PARAMETERS.get(model)
+    if names is None or len(names) != len(params):
+        raise ToolError(
+            f"COLMAP returned a camera of model {model}, which is not supported.",
+            hint=f"Choose one of {', '.join(sorted(LENS_PARAMETERS))}.",
+        )
+    values = {name: float(value) for name, value in zip(names, params, strict=True)}
+    focal = values.pop("f", None)
+    if focal is not None:
+        values |= {"fl_x": focal, "fl_y": focal}
+    ours = "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV"
+    if model.endswith("PINHOLE"):
+        ours = "PINHOLE"
+    return Intrinsics(width=width, height=height, model=ours, **values)
+
+
+def read_statistics(database: Path, num_images: int) -> PairStatistics:
+    """What extraction and matching put into the database.
+
+    Call it only while pycolmap has the database closed (see `pipelines.tools.colmap`).
+    """
+    num_features = np.zeros(num_images, np.int64)
+    best = np.zeros(num_images, np.int64)
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        images = {
+            image_id: (image_index(name), width, height)
+            for image_id, name, width, height in connection.execute(
+                "SELECT image_id, name, width, height FROM images "
+                "JOIN cameras ON cameras.camera_id = images.camera_id"
+            )
+        }
+        for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints"):
+            num_features[images[image_id][0]] = rows
+        pairs = connection.execute(
+            "SELECT pair_id, rows, config, H FROM two_view_geometries"
+        ).fetchall()
+    homographies: list[npt.NDArray[np.float64]] = []
+    for pair_id, rows, config, blob in pairs:
+        first, second = (images[i] for i in pycolmap.pair_id_to_image_pair(pair_id))
+        for index, _, _ in (first, second):
+            best[index] = max(best[index], rows)
+        if rows > 0 and config in _ONE_HOMOGRAPHY and blob:
+            pixels = np.frombuffer(blob, np.float64).reshape(3, 3)
+            homographies.append(
+                _centred(*second[1:]) @ pixels @ np.linalg.inv(_centred(*first[1:]))
+            )
+    return PairStatistics(
+        num_features=num_features,
+        best_inliers=best,
+        num_pairs=len(pairs),
+        num_verified=sum(rows > 0 for _, rows, _, _ in pairs),
+        homographies=np.array(homographies, np.float64).reshape(-1, 3, 3),
+    )
+
+
+def _centred(width: int, height: int) -> npt.NDArray[np.float64]:
+    """Pixels to units of the long side from the image's centre, [3, 3]."""
+    side = float(max(width, height))
+    return np.array(
+        [[1 / side, 0, -width / 2 / side], [0, 1 / side, -height / 2 / side], [0, 0, 1]]
+    )
+
+
+def image_index(name: str) -> int:
+    """The index that an image's name in the database stands for."""
+    return int(Path(name).stem)
+
+
+def sparse_model(reconstruction: Any) -> SparseModel:
+    """A `pycolmap.Reconstruction` as plain arrays."""
+    images = sorted(
+        (reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()),
+        key=lambda image: image_index(image.name),
+    )
+    camera_ids = sorted({image.camera_id for image in images})
+    cameras = [reconstruction.camera(camera_id) for camera_id in camera_ids]
+    poses = np.stack([image.cam_from_world().inverse().matrix() for image in images])
+    points = list(reconstruction.points3D.values())
+    center_of = {image.image_id: pose[:, 3] for image, pose in zip(images, poses, strict=True)}
+    return SparseModel(
+        indices=tuple(image_index(image.name) for image in images),
+        cameras=tuple(
+            intrinsics_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
+            for camera in cameras
+        ),
+        camera_of=tuple(camera_ids.index(image.camera_id) for image in images),
+        world_from_camera=poses,
+        points=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        track_lengths=np.array([point.track.length() for point in points], np.int64),
+        error_px=float(reconstruction.compute_mean_reprojection_error()),
+        angle_deg=_median_widest_angle_deg(points, center_of),
+    )
+
+
+def _median_widest_angle_deg(
+    points: Sequence[Any], center_of: dict[int, npt.NDArray[np.float64]]
+) -> float:
+    """The median over (at most 3,000) points of the widest angle between their rays, degrees."""
+    if not points:
+        return 0.0
+    widest: list[float] = []
+    for point in points[:: max(1, len(points) // _ANGLE_SAMPLE)]:
+        centers = np.array([center_of[element.image_id] for element in point.track.elements])
+        rays = point.xyz - centers
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        widest.append(float(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+    return float(np.degrees(np.median(widest)))

@@ -1,0 +1,268 @@
+"""Jobs through real workers, a real Redis and real stage processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.integration.engine import Engine, is_running
+from tests.integration.toy_stages import STAGES
+from tests.services import RedisServer
+
+pytestmark = pytest.mark.services
+SLOW = {"train": {"steps": 60, "step_s": 0.1, "save_every": 5}}
+
+
+@pytest.fixture
+def engine(tmp_path: Path, redis_server: RedisServer) -> Iterator[Engine]:
+    made = Engine(tmp_path, redis_server.url)
+    yield made
+    made.close()
+
+
+def test_a_job_goes_through_all_stages_once(engine: Engine) -> None:
+    engine.start_worker()
+    job_id = engine.submit({"mesh": {"spy": True}}, skip=())
+    job = engine.wait_for(job_id, "succeeded", "failed")
+    assert job.state == "succeeded", job.error
+    assert [row.attempt for row in job.stages] == [1] * len(STAGES)
+    assert len(engine.notes("")) == 2 * len(STAGES)
+    report = engine.stage(job_id, "report")
+    assert report.summary == {"steps": 2, "first": 0, "read": ["ingest", "train", "mesh", "video"]}
+    assert report.output_prefix is not None
+    assert f"{report.output_prefix}manifest.json" in list(engine.store.list(report.output_prefix))
+    assert f"{report.output_prefix}deep/result ä.txt" in list(engine.store.list(f"jobs/{job_id}/"))
+    assert "train step 2" in engine.log(job_id, "train")
+    pids = {line.split()[-1] for line in engine.notes("") if " start " in line}
+    assert len(pids) == 1, "one warm process serves all stages of a slot"
+    mesh = engine.stage(job_id, "mesh")
+    spied = json.loads(b"".join(engine.store.read(f"{mesh.output_prefix}environment.json")))
+    assert not [name for name in spied if "TOKEN" in name or "REDIS" in name or "SECRET" in name]
+    engine.wait(lambda: not list((engine.folder / "home" / "work").iterdir()), 45)
+
+
+def test_skipped_stages_are_passed_over(engine: Engine) -> None:
+    engine.start_worker()
+    job = engine.wait_for(engine.submit({}, skip=("frames",)), "succeeded", "failed")
+    assert job.state == "succeeded", job.error
+    assert {row.name: row.state for row in job.stages}["frames"] == "skipped"
+    assert not engine.notes("frames")
+
+
+def test_an_error_of_the_input_fails_the_job_at_once_with_its_code(engine: Engine) -> None:
+    engine.start_worker()
+    job = engine.wait_for(engine.submit({"frames": {"fail": True}}), "succeeded", "failed")
+    assert job.state == "failed"
+    assert job.error is not None
+    assert (job.error["code"], job.error["stage"]) == ("no_images", "frames")
+    assert {row.name: row.state for row in job.stages}["train"] == "cancelled"
+    assert len(engine.notes("frames start")) == 1
+
+
+def test_a_fault_of_ours_shows_no_path_but_leaves_its_trace_in_the_log(engine: Engine) -> None:
+    engine.start_worker()
+    job = engine.wait_for(engine.submit({"frames": {"fault": True}}), "succeeded", "failed")
+    assert job.error is not None
+    assert job.error["code"] == "internal_error"
+    assert "/secret" not in json.dumps(job.error)
+    assert any("ZeroDivisionError: /secret/path" in line for line in engine.log(job.id))
+
+
+def test_a_retryable_error_is_tried_again(engine: Engine) -> None:
+    engine.start_worker()
+    job_id = engine.submit({"frames": {"fail_times": 1}})
+    assert engine.wait_for(job_id, "succeeded", "failed").state == "succeeded"
+    assert engine.stage(job_id, "frames").attempt == 2
+
+
+def test_cancel_stops_a_busy_stage_and_what_it_started(engine: Engine) -> None:
+    engine.start_worker()
+    job_id = engine.submit({"train": {"steps": 600, "step_s": 0.1, "child": True}})
+    engine.wait(lambda: engine.notes("train child"))
+    begun = time.monotonic()
+    engine.cancel(job_id)
+    assert engine.wait_for(job_id, "cancelled").finished_at is not None
+    assert time.monotonic() - begun < 10
+    assert not engine.notes("train end")
+
+
+def test_cancel_kills_a_deaf_stage_within_ten_seconds_with_all_it_started(engine: Engine) -> None:
+    engine.start_worker()
+    job_id = engine.submit({"train": {"child": True, "deaf_s": 300}})
+    engine.wait(lambda: engine.notes("train child"))
+    stage_pid = int(engine.notes("train start")[0].split()[-1])
+    child_pid = int(engine.notes("train child")[0].split()[-1])
+    begun = time.monotonic()
+    engine.cancel(job_id)
+    engine.wait_for(job_id, "cancelled")
+    assert time.monotonic() - begun < 10
+    assert not is_running(stage_pid)
+    engine.wait(lambda: not is_running(child_pid), 5)
+    second = engine.submit({})
+    assert engine.wait_for(second, "succeeded", "failed").state == "succeeded"
+
+
+def test_a_stage_over_its_time_limit_fails(engine: Engine) -> None:
+    engine.start_worker()
+    job = engine.wait_for(
+        engine.submit({"mesh": {"steps": 600, "step_s": 0.1}}), "succeeded", "failed"
+    )
+    assert job.error is not None
+    assert (job.error["code"], job.error["stage"]) == ("time_limit", "mesh")
+
+
+def test_a_killed_stage_process_resumes_from_its_checkpoint(engine: Engine) -> None:
+    engine.start_worker()
+    job_id = engine.submit(SLOW)
+    engine.wait(lambda: engine.stage(job_id, "train").checkpoint_prefix)
+    os.kill(int(engine.notes("train start")[0].split()[-1]), signal.SIGKILL)
+    job = engine.wait_for(job_id, "succeeded", "failed")
+    assert job.state == "succeeded", job.error
+    train = engine.stage(job_id, "train")
+    assert (train.attempt, train.crashes) == (2, 1)
+    assert train.summary is not None
+    assert train.summary["first"] >= 5
+    assert len(engine.notes("train resume")) == 1
+    assert all(len(engine.notes(f"{stage.name} end")) == 1 for stage in STAGES)
+    kept = list(engine.store.list(f"jobs/{job_id}/train/"))
+    assert all(key.startswith(str(train.output_prefix)) for key in kept), "checkpoints are gone"
+
+
+def test_a_stage_that_crashes_each_time_fails_the_job(engine: Engine) -> None:
+    engine.start_worker()
+    job_id = engine.submit({"train": {"crash_times": 9}})
+    job = engine.wait_for(job_id, "succeeded", "failed", timeout_s=60)
+    assert job.state == "failed"
+    assert job.error is not None
+    assert job.error["code"] == "worker_lost"
+    assert len(engine.notes("train start")) == 3
+
+
+def test_a_killed_worker_takes_its_stage_process_along_and_its_next_self_resumes(
+    engine: Engine,
+) -> None:
+    worker = engine.start_worker("w1")
+    job_id = engine.submit({"train": {**SLOW["train"], "child": True}})
+    engine.wait(lambda: engine.stage(job_id, "train").checkpoint_prefix)
+    stage_pid = int(engine.notes("train start")[0].split()[-1])
+    child_pid = int(engine.notes("train child")[0].split()[-1])
+    worker.kill()
+    worker.wait()
+    engine.wait(lambda: not is_running(stage_pid) and not is_running(child_pid), 10)
+    engine.start_worker("w1")
+    job = engine.wait_for(job_id, "succeeded", "failed")
+    assert job.state == "succeeded", job.error
+    assert len(engine.notes("train resume")) == 1
+    assert all(len(engine.notes(f"{stage.name} end")) == 1 for stage in STAGES)
+
+
+def test_a_deaf_stage_dies_with_its_killed_worker(engine: Engine) -> None:
+    worker = engine.start_worker()
+    engine.submit({"train": {"child": True, "deaf_s": 300}})
+    engine.wait(lambda: engine.notes("train child"))
+    stage_pid = int(engine.notes("train start")[0].split()[-1])
+    child_pid = int(engine.notes("train child")[0].split()[-1])
+    worker.kill()
+    worker.wait()
+    engine.wait(lambda: not is_running(stage_pid) and not is_running(child_pid), 10)
+
+
+def test_another_worker_takes_over_when_the_lease_has_run_out(
+    tmp_path: Path, redis_server: RedisServer
+) -> None:
+    engine = Engine(
+        tmp_path,
+        redis_server.url,
+        NERFWORKS_WORKER_LEASE_S="4",
+        NERFWORKS_WORKER_HEARTBEAT_S="1",
+    )
+    try:
+        first = engine.start_worker("w1")
+        job_id = engine.submit(SLOW)
+        engine.wait(lambda: engine.stage(job_id, "train").checkpoint_prefix)
+        engine.start_worker("w2")
+        first.kill()
+        job = engine.wait_for(job_id, "succeeded", "failed")
+        assert job.state == "succeeded", job.error
+        assert len(engine.notes("train resume")) == 1
+        assert engine.stage(job_id, "train").crashes == 1
+    finally:
+        engine.close()
+
+
+def test_sigterm_gives_the_stage_back_without_counting_and_ends_in_seconds(engine: Engine) -> None:
+    worker = engine.start_worker("w1")
+    job_id = engine.submit(SLOW)
+    engine.wait(lambda: engine.stage(job_id, "train").checkpoint_prefix)
+    begun = time.monotonic()
+    worker.terminate()
+    worker.wait(20)
+    assert time.monotonic() - begun < 10
+    train = engine.stage(job_id, "train")
+    assert (train.state, train.attempt, train.crashes) == ("ready", 0, 0)
+    assert train.checkpoint_prefix is not None
+    engine.start_worker("w2")
+    assert engine.wait_for(job_id, "succeeded", "failed").state == "succeeded"
+    assert len(engine.notes("train resume")) == 1
+
+
+def test_duplicate_messages_start_nothing_twice(engine: Engine) -> None:
+    job_id = engine.submit({"train": {"steps": 10, "step_s": 0.1}})
+    for _ in range(5):
+        for stage in STAGES:
+            engine.bell.ring(engine.database, [f"{job_id}-{stage.name}"])
+    engine.start_worker("w1", "--slots", "2")
+    engine.start_worker("w2")
+    assert engine.wait_for(job_id, "succeeded", "failed").state == "succeeded"
+    time.sleep(1.5)
+    assert all(len(engine.notes(f"{stage.name} start")) == 1 for stage in STAGES)
+
+
+def test_a_job_that_was_never_rung_for_is_found(engine: Engine) -> None:
+    engine.start_worker()
+    job_id = engine.submit({}, ring=False)
+    assert engine.wait_for(job_id, "succeeded", "failed").state == "succeeded"
+
+
+def test_work_goes_on_while_redis_is_gone(engine: Engine, redis_server: RedisServer) -> None:
+    engine.start_worker()
+    engine.wait_for(engine.submit({}), "succeeded")
+    redis_server.kill()
+    job_id = engine.submit(SLOW | {"train": {"steps": 5, "step_s": 0.1}})
+    assert engine.wait_for(job_id, "succeeded", "failed", timeout_s=60).state == "succeeded"
+
+
+def test_a_worker_consumes_again_after_redis_was_killed_and_started(
+    tmp_path: Path, redis_server: RedisServer
+) -> None:
+    """With the direct way out of reach, only the bell can bring the second job's start."""
+    engine = Engine(
+        tmp_path,
+        redis_server.url,
+        NERFWORKS_WORKER_DIRECT_AFTER_S="3000",
+        NERFWORKS_WORKER_RING_AGAIN_S="3000",
+    )
+    try:
+        engine.start_worker()
+        busy = engine.submit(SLOW)
+        engine.wait(lambda: engine.notes("train start"))
+        redis_server.kill()
+        time.sleep(2)
+        redis_server.start()
+        assert engine.wait_for(busy, "succeeded", "failed").state == "succeeded"
+        assert len(engine.notes("train start")) == 1
+        for _ in range(2):
+            redis_server.kill()
+            time.sleep(0.5)
+            redis_server.start()
+            time.sleep(3)
+            second = engine.submit({})
+            assert engine.wait_for(second, "succeeded", "failed", timeout_s=30)
+    finally:
+        engine.close()

@@ -1,0 +1,207 @@
+"""The real application on a real SQLite file and a real object folder; no mocks."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from PIL import Image
+
+from api.app import create_app
+from api.deps import Services
+from api.settings import ApiSettings
+from pipelines.registry import STAGES
+from storage.jobs import stage_id
+from storage.keys import attempt_prefix
+from storage.leases import claim_stage, succeed_stage
+from storage.queries import get_job
+from tests.services import free_port
+
+KEY = "nw_test_key_for_the_unit_tests"
+LEASE_S = 60.0
+
+
+def zip_of_pictures(num: int = 3) -> bytes:
+    """A .zip of tiny PNG pictures."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for index in range(num):
+            picture = io.BytesIO()
+            Image.new("RGB", (16, 12), (index * 20 % 256, 80, 120)).save(picture, "PNG")
+            archive.writestr(f"photo_{index}.png", picture.getvalue())
+    return packed.getvalue()
+
+
+def settings_for(home: Path, **changes: Any) -> ApiSettings:
+    """Settings of a service of the test's own. Nothing listens at its broker's address."""
+    values: dict[str, Any] = {
+        "home": home,
+        "redis_url": f"redis://127.0.0.1:{free_port()}/0",
+        "bootstrap_api_key": KEY,
+        "min_free_bytes": 0,
+        "public_url": "http://127.0.0.1:8000",
+        "database_url": "",
+        "objects_url": "",
+        **changes,
+    }
+    return ApiSettings(**values)
+
+
+@dataclass
+class Service:
+    """A running application. http: authorised. anyone: without a key."""
+
+    http: httpx.Client
+    anyone: httpx.Client
+    services: Services
+
+    def upload(self, content: bytes | None = None, filename: str = "photos.zip") -> dict[str, Any]:
+        """Send a capture, a .zip of pictures by default."""
+        content = zip_of_pictures() if content is None else content
+        answer = self.http.post("/v1/captures", files={"file": (filename, content)})
+        assert answer.status_code == 201, answer.text
+        made: dict[str, Any] = answer.json()
+        return made
+
+    def job(self, capture_id: str | None = None, **wanted: Any) -> dict[str, Any]:
+        """Start a job."""
+        body = {"capture_id": capture_id or self.upload()["id"], **wanted}
+        answer = self.http.post("/v1/jobs", json=body)
+        assert answer.status_code == 202, answer.text
+        made: dict[str, Any] = answer.json()
+        return made
+
+    def objects(self) -> list[Path]:
+        """Every file in the object store and the staging folder."""
+        home = self.services.settings.home
+        return [
+            path
+            for folder in (home / "objects", home / "staging")
+            for path in folder.rglob("*")
+            if path.is_file()
+        ]
+
+
+def run_stage(services: Services, job_id: str, name: str, files: dict[str, bytes]) -> None:
+    """Do what a worker does for one ready stage: claim, publish, succeed."""
+    with services.database.session_scope() as session:
+        claim = claim_stage(session, stage_id(job_id, name), "test", LEASE_S)
+    assert claim is not None, f"{name} is not ready"
+    prefix = attempt_prefix(job_id, name, claim.attempt, claim.token)
+    entries = []
+    for path, content in files.items():
+        source = services.settings.home / "published"
+        source.write_bytes(content)
+        services.store.put_file(prefix + path, source)
+        source.unlink()
+        digest = hashlib.sha256(content).hexdigest()
+        entries.append({"path": path, "bytes": len(content), "sha256": digest})
+    summary = {"psnr": 25.5, "ssim": 0.9, "num_images": 7, "width": 480, "height": 270}
+    manifest = {"files": entries, "summary": summary if name == "evaluate" else {}}
+    with services.database.session_scope() as session:
+        succeed_stage(session, claim, manifest=manifest, output_prefix=prefix)
+
+
+def finish_job(services: Services, job_id: str, content_of: Callable[[str], bytes]) -> None:
+    """Run all stages of a job; each artifact holds what `content_of` gives for its name."""
+    for stage in STAGES:
+        with services.database.read_scope() as session:
+            rows = {row.name: row.state for row in get_job(session, job_id).stages}
+        if rows[stage.name] != "skipped":
+            files = {artifact.path: content_of(artifact.name) for artifact in stage.artifacts}
+            run_stage(services, job_id, stage.name, files)
+
+
+class LiveServer:
+    """A uvicorn on a port of its own, which can be stopped and started again."""
+
+    def __init__(self, settings: ApiSettings) -> None:
+        self.settings = settings
+        self.port = free_port()
+        self.url = f"http://127.0.0.1:{self.port}"
+        self._server: uvicorn.Server | None = None
+        self._thread: threading.Thread | None = None
+        self.services: Services
+
+    def start(self) -> None:
+        app = create_app(self.settings)
+        config = uvicorn.Config(
+            app, port=self.port, log_config=None, access_log=False, timeout_graceful_shutdown=1
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._server.run, daemon=True)
+        self._thread.start()
+        deadline = time.monotonic() + 20
+        while not self._server.started:
+            assert time.monotonic() < deadline
+            assert self._thread.is_alive()
+            time.sleep(0.02)
+        self.services = app.state.services
+
+    def stop(self) -> None:
+        assert self._server is not None
+        assert self._thread is not None
+        self._server.should_exit = True
+        self._thread.join(10)
+
+
+@contextmanager
+def serving(settings: ApiSettings) -> Iterator[Service]:
+    """A live application, and clients of it."""
+    server = LiveServer(settings)
+    server.start()
+    authorised = {"Authorization": f"Bearer {KEY}"}
+    try:
+        with (
+            httpx.Client(base_url=server.url, headers=authorised, timeout=30) as http,
+            httpx.Client(base_url=server.url, timeout=30) as anyone,
+        ):
+            yield Service(http, anyone, server.services)
+    finally:
+        server.stop()
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    """A fresh service."""
+    with serving(settings_for(tmp_path / "home")) as made:
+        yield made
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[LiveServer]:
+    """A live server."""
+    server = LiveServer(settings_for(tmp_path / "home"))
+    server.start()
+    yield server
+    server.stop()
+
+
+def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
+    """Assert that the answer is the one shape of an error; returns it."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.headers["x-request-id"]
+    found: dict[str, Any] = answer.json()
+    assert set(found) == {
+        *("type", "title", "status", "detail", "instance", "code", "hint", "errors")
+    }
+    assert found["status"] == status
+    assert found["code"] == code, found
+    assert found["type"] == f"urn:nerfworks:problem:{code}"
+    assert found["detail"]
+    assert found["hint"]
+    assert found["instance"] == answer.request.url.path
+    assert "Traceback" not in answer.text
+    return found

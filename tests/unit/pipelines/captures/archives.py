@@ -1,0 +1,102 @@
+"""Small captures for the tests: pictures, archives and the context of a stage."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+
+from pipelines.stage import StageContext
+from pipelines.workspace import Workspace
+
+
+def picture(
+    width: int = 64,
+    height: int = 48,
+    seed: int = 0,
+    kind: str = "JPEG",
+    **save: Any,
+) -> bytes:
+    """A noisy picture with a red top left corner, encoded."""
+    pixels = np.random.default_rng(seed).integers(0, 120, (height, width, 3), np.uint8)
+    pixels[: height // 2, : width // 2] = (255, 0, 0)
+    stream = io.BytesIO()
+    PIL.Image.fromarray(pixels).save(stream, kind, **save)
+    return stream.getvalue()
+
+
+def write_zip(path: Path, files: Mapping[str, bytes | str], method: int = 8) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return path
+
+
+def context(root: Path, stage: str = "ingest") -> StageContext:
+    """A context with an empty `out`, as a runner makes it."""
+    workspace = Workspace(root)
+    out = workspace.partial(stage)
+    out.mkdir(parents=True)
+    return StageContext(
+        stage=stage, workspace=workspace, out=out, checkpoint=workspace.checkpoint(stage)
+    )
+
+
+def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> list[list[float]]:
+    """A camera at a place, unrotated, 4x4."""
+    return [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z], [0, 0, 0, 1]]
+
+
+def nerfstudio_files(count: int = 4, **top: Any) -> dict[str, bytes | str]:
+    """A capture in nerfstudio's layout, as archive entries."""
+    frames = [
+        {"file_path": f"images/{n}.jpg", "transform_matrix": pose(x=float(n))} for n in range(count)
+    ]
+    transforms = {"fl_x": 60.0, "fl_y": 61.0, "cx": 31.0, "cy": 23.0, "w": 64, "h": 48}
+    return {
+        "transforms.json": json.dumps({**transforms, "frames": frames, **top}),
+        **{f"images/{n}.jpg": picture(seed=n) for n in range(count)},
+    }
+
+
+def polycam_files(
+    count: int = 4, corrected: bool = True, blur_scores: list[float] | None = None
+) -> dict[str, bytes | str]:
+    """A Polycam raw export: camera n is at ARKit position (n, 0.5, -2)."""
+    prefix = "corrected_" if corrected else ""
+    files: dict[str, bytes | str] = {"mesh_info.json": "{}"}
+    for n in range(count):
+        camera: dict[str, float] = {
+            "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48,
+            "blur_score": blur_scores[n] if blur_scores else 100.0,
+        }  # fmt: skip
+        rows = pose(float(n), 0.5, -2.0)
+        camera |= {f"t_{r}{c}": float(rows[r][c]) for r in range(3) for c in range(4)}
+        stamp = 1_000_000 + n * 500_000
+        files[f"keyframes/{prefix}images/{stamp}.jpg"] = picture(seed=n)
+        files[f"keyframes/{prefix}cameras/{stamp}.json"] = json.dumps(camera)
+    return files
+
+
+def record3d_files(
+    count: int = 12, absent: tuple[int, ...] = (), **metadata: Any
+) -> dict[str, bytes | str]:
+    """A Record3D export: frame n is at ARKit position (n, 0.5, -2)."""
+    values = {
+        "w": 64,
+        "h": 48,
+        "K": [60.0, 0, 0, 0, 61.0, 0, 31.0, 23.0, 1],
+        "poses": [[0, 0, 0, 1, n, 0.5, -2.0] for n in range(count)],
+        "frameTimestamps": [n / 60 for n in range(count)],
+        **metadata,
+    }
+    return {
+        "EXR_RGBD/metadata.json": json.dumps(values),
+        **{f"EXR_RGBD/rgb/{n}.jpg": picture(seed=n) for n in range(count) if n not in absent},
+    }

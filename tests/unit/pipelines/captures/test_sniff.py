@@ -1,0 +1,230 @@
+"""An upload is recognised by its content, and what is dangerous is refused before it is stored."""
+
+from __future__ import annotations
+
+import io
+import stat
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from pipelines.captures.sniff import ArchiveLimits, sniff
+from pipelines.errors import CaptureError
+from tests.unit.pipelines.captures.archives import (
+    nerfstudio_files,
+    picture,
+    polycam_files,
+    record3d_files,
+    write_zip,
+)
+
+MP4 = b"\x00\x00\x00\x20ftypisom" + bytes(40)
+
+
+def code_of(path: Path, filename: str = "x.zip", limits: ArchiveLimits | None = None) -> str:
+    with pytest.raises(CaptureError) as caught:
+        sniff(path, filename, limits)
+    assert caught.value.hint
+    assert str(path.parent) not in caught.value.message
+    return caught.value.code
+
+
+def test_video_is_recognised_under_a_false_name(tmp_path: Path) -> None:
+    path = tmp_path / "holiday.zip"
+    path.write_bytes(MP4)
+    assert sniff(path, "holiday.zip").kind == "video"
+
+
+@pytest.mark.parametrize(
+    ("head", "container"),
+    [
+        (MP4, "mov"),
+        (b"\x00\x00\x00\x08wide\x00\x00\x00\x00mdat", "mov"),
+        (b"\x1a\x45\xdf\xa3" + bytes(60), "matroska"),
+        (b"RIFF\x00\x00\x00\x00AVI LIST", "avi"),
+    ],
+)
+def test_video_containers_are_told_apart(tmp_path: Path, head: bytes, container: str) -> None:
+    path = tmp_path / "capture"
+    path.write_bytes(head)
+    assert sniff(path, "v").details == {"container": container}
+
+
+def test_empty_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "capture"
+    path.touch()
+    assert code_of(path) == "empty_file"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"hello, this is text",
+        b"The wide, free world of text",
+        b"#EXTM3U\nfile:///etc/passwd\n",
+        b"Rar!\x1a\x07\x00",
+        b"\x00\x00\x00\x18ftypheic" + bytes(40),
+    ],
+)
+def test_other_files_are_of_unknown_type(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "capture"
+    path.write_bytes(data)
+    assert code_of(path, "clip.mp4") == "unknown_type"
+
+
+def test_single_photo_is_refused_with_advice_to_send_many(tmp_path: Path) -> None:
+    path = tmp_path / "capture"
+    path.write_bytes(picture())
+    with pytest.raises(CaptureError, match="single picture") as caught:
+        sniff(path, "photo.jpg")
+    assert caught.value.code == "unknown_type"
+    assert ".zip" in caught.value.hint
+
+
+@pytest.mark.parametrize("top", ["", "My export/"])
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [
+        ("nerfstudio", nerfstudio_files()),
+        ("polycam", polycam_files()),
+        ("polycam", polycam_files(corrected=False)),
+        ("record3d", record3d_files()),
+        ("images", {"b.png": picture(kind="PNG"), "sub/a.data": picture()}),
+    ],
+)
+def test_archives_are_told_apart_with_and_without_a_top_folder(
+    tmp_path: Path, kind: str, files: dict[str, bytes | str], top: str
+) -> None:
+    path = write_zip(tmp_path / "c", {top + name: data for name, data in files.items()})
+    assert sniff(path, "capture.bin").kind == kind
+
+
+def test_r3d_file_is_a_record3d_capture(tmp_path: Path) -> None:
+    path = write_zip(
+        tmp_path / "c", {"metadata": "{}", "rgbd/0.jpg": picture(), "rgbd/0.depth": ""}
+    )
+    assert sniff(path, "scan.r3d").kind == "record3d"
+
+
+def test_litter_of_macos_counts_for_nothing(tmp_path: Path) -> None:
+    files = {
+        "a.jpg": picture(),
+        "__MACOSX/._a.jpg": picture(),
+        "._b.jpg": picture(),
+        ".DS_Store": b"\x00" * 10,
+    }
+    assert sniff(write_zip(tmp_path / "c", files), "c.zip").details["num_images"] == 1
+
+
+def test_zip_without_pictures_is_refused(tmp_path: Path) -> None:
+    assert code_of(write_zip(tmp_path / "c", {"a.jpg": "no picture", "b.txt": "x"})) == "no_images"
+    assert code_of(write_zip(tmp_path / "d", {})) == "no_images"
+
+
+def test_zip_of_heic_names_the_format(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {"a.jpg": b"\x00\x00\x00\x18ftypheic" + bytes(40)})
+    with pytest.raises(CaptureError) as caught:
+        sniff(path, "c.zip")
+    assert (caught.value.code, "HEIC" in caught.value.hint) == ("no_images", True)
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil.jpg", "a/../../evil.jpg", "/etc/evil.jpg", "C:evil.jpg", "a\\evil.jpg"]
+)
+def test_unsafe_names_are_refused(tmp_path: Path, name: str) -> None:
+    assert code_of(write_zip(tmp_path / "c", {"a.jpg": picture(), name: picture()})) == (
+        "archive_unsafe"
+    )
+
+
+def test_name_with_nul_is_refused(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {"evil.jpgX.txt": picture()})
+    path.write_bytes(path.read_bytes().replace(b"evil.jpgX", b"evil.jpg\0"))
+    assert code_of(path) == "archive_unsafe"
+
+
+@pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFCHR, stat.S_IFIFO])
+def test_links_and_devices_are_refused(tmp_path: Path, kind: int) -> None:
+    path = tmp_path / "c"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.jpg", picture())
+        info = zipfile.ZipInfo("link.jpg")
+        info.create_system = 3
+        info.external_attr = (kind | 0o777) << 16
+        archive.writestr(info, "/etc/passwd")
+    assert code_of(path) == "archive_unsafe"
+
+
+def test_encrypted_archive_is_refused(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {"a.jpg": picture()})
+    data = bytearray(path.read_bytes())
+    for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        data[data.index(mark) + offset] |= 1
+    path.write_bytes(data)
+    assert code_of(path) == "archive_encrypted"
+
+
+def test_bomb_is_refused_by_its_ratio(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {"a.jpg": picture(), "b.jpg": bytes(30 << 20)})
+    assert path.stat().st_size < 100_000
+    assert code_of(path) == "archive_bomb"
+
+
+def test_bomb_of_many_small_entries_is_refused(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {f"{n}.jpg": bytes(1 << 20) for n in range(8)})
+    assert code_of(path) == "archive_bomb"
+
+
+def test_archive_over_the_limits_is_refused(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {f"{n}.jpg": picture(seed=n) for n in range(5)})
+    assert sniff(path, "c.zip").details["num_images"] == 5
+    assert code_of(path, limits=ArchiveLimits(max_entries=4)) == "archive_bomb"
+    assert code_of(path, limits=ArchiveLimits(max_unpacked_bytes=1000)) == "archive_bomb"
+
+
+def test_entries_that_share_bytes_are_refused(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {"a.jpg": picture(seed=1), "b.jpg": picture(seed=2)}, 0)
+    data = bytearray(path.read_bytes())
+    second = data.index(b"PK\x01\x02", data.index(b"PK\x01\x02") + 1)
+    data[second + 42 : second + 46] = struct.pack("<I", 0)
+    path.write_bytes(data)
+    assert code_of(path) == "archive_bomb"
+
+
+def test_archive_in_an_archive_is_refused(tmp_path: Path) -> None:
+    inner = io.BytesIO()
+    with zipfile.ZipFile(inner, "w") as archive:
+        archive.writestr("b.jpg", picture())
+    path = write_zip(tmp_path / "c", {"a.jpg": picture(), "innocent.jpg": inner.getvalue()})
+    assert code_of(path) == "archive_unsafe"
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_two_entries_of_one_name_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.jpg", picture())
+        archive.writestr("a.jpg", picture(seed=3))
+    assert code_of(path) == "archive_unsafe"
+
+
+def test_cut_off_archive_is_damaged(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "c", {f"{n}.jpg": picture(seed=n) for n in range(5)})
+    path.write_bytes(path.read_bytes()[:4000])
+    assert code_of(path) == "archive_damaged"
+
+
+def test_sniffing_loads_no_library_beyond_the_standard_one() -> None:
+    program = (
+        "import sys, pipelines.captures.sniff as s;"
+        "print(*sorted({m.split('.')[0] for m in sys.modules} - sys.stdlib_module_names))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    foreign = [name for name in done.stdout.split() if not name.startswith(("_", "pipelines"))]
+    assert foreign == []

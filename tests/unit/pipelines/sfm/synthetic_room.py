@@ -1,0 +1,97 @@
+"""Small pictures of a textured room corner from known cameras, for structure from motion."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
+_TEXTURE_PER_UNIT = 120.0
+
+
+def _texture(seed: int) -> np.ndarray:
+    """[512, 512, 3] in [0, 255]: blobs of many sizes, which SIFT likes."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((512, 512, 3))
+    for cells, weight in ((16, 0.5), (40, 1.0), (96, 1.0), (200, 0.6)):
+        noise = Image.fromarray(rng.integers(0, 256, (cells, cells, 3)).astype(np.uint8))
+        total += weight * np.asarray(noise.resize((512, 512), Image.Resampling.BICUBIC), float)
+    low, high = np.percentile(total, [1, 99])
+    return np.clip((total - low) / (high - low) * 255, 0, 255)
+
+
+_TEXTURES = [_texture(seed) for seed in range(3)]
+
+
+def pose_looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """world_from_camera [3, 4], OpenGL axes, level."""
+    z = (center - target) / np.linalg.norm(center - target)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z, center], axis=1)
+
+
+def render(pose: np.ndarray) -> Image.Image:
+    """The walls x = 0 and y = 0 and the floor z = 0, seen from within x, y, z > 0."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    local = np.stack(
+        [(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL, -np.ones_like(u)], axis=-1
+    )
+    rays = local @ pose[:, :3].T
+    center = pose[:, 3]
+    with np.errstate(divide="ignore"):
+        distances = np.where(rays < 0, -center / rays, np.inf)
+    wall = distances.argmin(axis=-1)
+    hit = center + rays * distances.min(axis=-1)[..., None]
+    picture = np.zeros((HEIGHT, WIDTH, 3))
+    for axis, texture in enumerate(_TEXTURES):
+        here = wall == axis
+        a, b = (hit[here][:, other] * _TEXTURE_PER_UNIT for other in range(3) if other != axis)
+        picture[here] = _bilinear(texture, a, b)
+    return Image.fromarray(picture.round().astype(np.uint8))
+
+
+def _bilinear(texture: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The texture, repeated by mirroring, at fractional positions."""
+    size = len(texture) - 1
+    a, b = (size - np.abs(values % (2 * size) - size) for values in (a, b))
+    i, j = np.minimum(a.astype(int), size - 1), np.minimum(b.astype(int), size - 1)
+    s, t = (a - i)[:, None], (b - j)[:, None]
+    top = texture[i, j] * (1 - t) + texture[i, j + 1] * t
+    bottom = texture[i + 1, j] * (1 - t) + texture[i + 1, j + 1] * t
+    return top * (1 - s) + bottom * s
+
+
+def arc_poses(num: int) -> np.ndarray:
+    """[num, 3, 4]: an arc that looks down into the corner."""
+    target = np.array([0.6, 0.6, 0.5])
+    angles = np.radians(np.linspace(20, 70, num))
+    centers = np.stack(
+        [2.6 * np.cos(angles), 2.6 * np.sin(angles), 1.6 + 0.3 * np.cos(3 * angles)], axis=1
+    )
+    return np.stack([pose_looking_at(center, target) for center in centers])
+
+
+def turning_poses(num: int) -> np.ndarray:
+    """[num, 3, 4]: one place, turning on the spot."""
+    center = np.array([2.2, 2.2, 1.4])
+    angles = np.radians(np.linspace(200, 250, num))
+    return np.stack(
+        [pose_looking_at(center, center + np.array([np.cos(a), np.sin(a), -0.25])) for a in angles]
+    )
+
+
+def save_video_frames(root: Path, pictures: list[Image.Image]) -> None:
+    """A job's folder as the frames stage leaves it, half a second between frames."""
+    folder = root / "frames" / "images"
+    folder.mkdir(parents=True)
+    frames = []
+    for index, picture in enumerate(pictures):
+        name = f"frame_{index + 1:05d}.jpg"
+        picture.save(folder / name, quality=95)
+        frames.append({"file": f"images/{name}", "timestamp_s": 0.5 * index})
+    (root / "frames" / "frames.json").write_text(json.dumps({"frames": frames}), "utf-8")
+    (root / "frames" / "manifest.json").write_text("{}", "utf-8")

@@ -1,0 +1,171 @@
+"""The poses stage on small rendered pictures: real COLMAP, known cameras."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.cameras_file import CamerasFile
+from pipelines.errors import Cancelled, PosesError
+from pipelines.options import PosesOptions
+from pipelines.orientation import align_points
+from pipelines.ply import read_ply
+from pipelines.stage import StageContext
+from pipelines.stages.poses import run
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.sfm.synthetic_room import (
+    FOCAL,
+    arc_poses,
+    render,
+    save_video_frames,
+    turning_poses,
+)
+
+OPTIONS = PosesOptions(num_features=1500, max_image_px=400, camera_model="SIMPLE_RADIAL")
+
+
+def context(root: Path, **more: Any) -> StageContext:
+    out = root / ".partial" / "poses"
+    out.mkdir(parents=True, exist_ok=True)
+    workspace = Workspace(root)
+    return StageContext("poses", workspace, out, workspace.checkpoint("poses"), **more)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], list[Any]]:
+    """A finished stage on 12 views; the third frame is blank."""
+    root = tmp_path_factory.mktemp("job")
+    pictures = [render(pose) for pose in arc_poses(12)]
+    pictures[2] = Image.new("RGB", pictures[2].size, (90, 90, 90))
+    save_video_frames(root, pictures)
+    reports: list[Any] = []
+    saved: list[int] = []
+    ctx = context(
+        root,
+        on_progress=lambda *report: reports.append(report),
+        on_checkpoint=lambda: saved.append(len(reports)),
+    )
+    summary = run(OPTIONS, ctx)
+    assert len(saved) == 2
+    return root, summary, reports
+
+
+def test_cameras_match_the_truth_up_to_a_similarity(job: tuple[Path, Any, Any]) -> None:
+    cameras = CamerasFile.load(job[0] / ".partial/poses/cameras.json")
+    poses = np.array([image.world_from_camera for image in cameras.images])
+    truth = np.delete(arc_poses(12), 2, axis=0)
+    move = align_points(poses[:, :, 3], truth[:, :, 3])
+    extent = np.ptp(truth[:, :, 3], axis=0).max()
+    errors = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - truth[:, :, 3], axis=1)
+    assert errors.mean() < 0.01 * extent
+    turned = move.apply_to_cameras(poses)[:, :, :3]
+    angles = np.degrees(np.arccos(((turned * truth[:, :, :3]).sum((1, 2)) - 1) / 2))
+    assert angles.max() < 1.0
+
+
+def test_the_world_is_upright_and_cameras_fill_the_unit_cube(job: tuple[Path, Any, Any]) -> None:
+    cameras = CamerasFile.load(job[0] / ".partial/poses/cameras.json")
+    poses = np.array([image.world_from_camera for image in cameras.images])
+    truth = np.delete(arc_poses(12), 2, axis=0)
+    np.testing.assert_allclose(poses[:, 2, :3], truth[:, 2, :3], atol=0.03)
+    assert np.abs(poses[:, :, 3]).max() == pytest.approx(1.0)
+    assert cameras.notes["up_from"] == "vertical"
+
+
+def test_the_lens_and_the_times_are_those_of_the_film(job: tuple[Path, Any, Any]) -> None:
+    cameras = CamerasFile.load(job[0] / ".partial/poses/cameras.json")
+    (lens,) = cameras.cameras
+    assert lens.fl_x == pytest.approx(FOCAL, rel=0.03)
+    assert [image.file for image in cameras.images][:3] == [
+        "images/frame_00001.jpg",
+        "images/frame_00002.jpg",
+        "images/frame_00004.jpg",
+    ]
+    assert [image.timestamp_s for image in cameras.images][:3] == [0.0, 0.5, 1.5]
+
+
+def test_sparse_points_lie_on_the_walls(job: tuple[Path, Any, Any]) -> None:
+    cameras = CamerasFile.load(job[0] / ".partial/poses/cameras.json")
+    poses = np.array([image.world_from_camera for image in cameras.images])
+    truth = np.delete(arc_poses(12), 2, axis=0)
+    sparse = read_ply(job[0] / ".partial/poses/points.ply")
+    move = align_points(poses[:, :, 3], truth[:, :, 3])
+    points = move.apply_to_points(sparse.points.astype(np.float64))
+    assert len(points) > 100
+    assert np.median(np.abs(points).min(axis=1)) < 0.02
+    assert sparse.colors is not None
+    assert sparse.colors.std() > 10
+
+
+def test_the_report_says_which_frame_is_missing_and_why(job: tuple[Path, Any, Any]) -> None:
+    root, summary, _ = job
+    report = json.loads((root / ".partial/poses/report.json").read_text("utf-8"))
+    assert (report["num_images"], report["num_registered"]) == (12, 11)
+    assert report["registered_ratio"] == pytest.approx(11 / 12)
+    assert report["mean_reprojection_error_px"] < 1.0
+    (missing,) = report["unregistered"]
+    assert missing["file"] == "images/frame_00003.jpg"
+    assert missing["timestamp_s"] == 1.0
+    assert missing["reason"] == "too few features (0)"
+    assert report["gaps_s"] == [[1.0, 1.0]]
+    assert {key: report[key] for key in summary if key != "gaps_s"} == {
+        key: summary[key] for key in summary if key != "gaps_s"
+    }
+
+
+def test_progress_never_goes_back_and_ends_at_one(job: tuple[Path, Any, list[Any]]) -> None:
+    fractions = [fraction for fraction, _, _ in job[2]]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+
+
+def test_a_second_attempt_takes_features_and_matches_from_the_checkpoint(
+    job: tuple[Path, Any, Any],
+) -> None:
+    messages: list[str] = []
+    ctx = context(job[0], on_progress=lambda _fraction, message, _eta: messages.append(message))
+    assert run(OPTIONS, ctx)["num_registered"] == 11
+    assert not [text for text in messages if "features" in text or "matching" in text]
+
+
+def test_flat_pictures_have_no_features(tmp_path: Path) -> None:
+    flat = [Image.new("RGB", (320, 240), (v, v, 128)) for v in range(100, 110)]
+    save_video_frames(tmp_path, flat)
+    with pytest.raises(PosesError) as caught:
+        run(OPTIONS, context(tmp_path))
+    assert caught.value.code == "no_features"
+    assert caught.value.message.startswith("0 of 10 images")
+
+
+def test_unrelated_pictures_do_not_register(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    noise = [
+        Image.fromarray(rng.integers(0, 256, (60, 80, 3)).astype(np.uint8)).resize((320, 240))
+        for _ in range(9)
+    ]
+    save_video_frames(tmp_path, noise)
+    with pytest.raises(PosesError) as caught:
+        run(OPTIONS, context(tmp_path))
+    assert caught.value.code == "too_few_registered"
+    assert caught.value.message == "0 of 9 frames registered, at least 8 are needed."
+    assert caught.value.details["reasons"] == {"too_few_matches": 9}
+
+
+def test_turning_on_the_spot_is_told_from_bad_matching(tmp_path: Path) -> None:
+    save_video_frames(tmp_path, [render(pose) for pose in turning_poses(10)])
+    with pytest.raises(PosesError) as caught:
+        run(OPTIONS, context(tmp_path))
+    assert caught.value.code == "no_parallax"
+    assert "Move sideways" in caught.value.hint
+
+
+def test_a_cancel_ends_the_running_call(tmp_path: Path) -> None:
+    save_video_frames(tmp_path, [render(pose) for pose in arc_poses(10)])
+    with pytest.raises(Cancelled):
+        run(OPTIONS, context(tmp_path, is_cancelled=lambda: True))
+    assert not (tmp_path / ".checkpoint/poses/state.json").exists()

@@ -1,0 +1,137 @@
+"""The train stage on a tiny capture: what it leaves, how it resumes, how it fails."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.cameras_file import CamerasFile
+from pipelines.errors import Cancelled, TrainingError
+from pipelines.manifest import RunHooks
+from pipelines.nerf.checkpoint import load_model
+from pipelines.trained_scene import TrainedScene
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.stages import tiny_job
+
+
+def test_summary_says_what_was_trained(trained_job: Workspace) -> None:
+    summary = trained_job.manifest("train")["summary"]
+    assert summary["num_steps"] == 60
+    assert summary["num_train"] + summary["num_test"] == tiny_job.NUM_IMAGES
+    assert summary["num_test"] == 5
+    assert (summary["width"], summary["height"]) == (36, 64)
+    assert summary["train_psnr"] > 9.0
+    assert set(summary["losses"]) >= {"rgb", "interlevel", "distortion", "camera"}
+    assert summary["camera_deltas"]["max_translation"] > 0.0
+
+
+def test_model_holds_all_that_rendering_needs(trained_job: Workspace, tmp_path: Path) -> None:
+    alone = tmp_path / "model.zip"
+    alone.write_bytes((trained_job.stage("train") / "model.zip").read_bytes())
+    scene = TrainedScene.load(alone)
+    assert len(scene.training_images()) == 15
+    assert len(scene.test_images()) == 5
+    image = scene.test_images()[0]
+    picture = scene.render(scene.lens_of(image), np.asarray(image.world_from_camera), 32)
+    assert picture.rgb.shape == (32, 18, 3)
+    assert scene.cameras == CamerasFile.load(trained_job.stage("train") / "cameras.json")
+
+
+def test_cameras_carry_the_corrections_of_training_images_only(trained_job: Workspace) -> None:
+    before = CamerasFile.load(trained_job.stage("ingest") / "cameras.json")
+    after = CamerasFile.load(trained_job.stage("train") / "cameras.json")
+    raw = {image.file: np.asarray(image.world_from_camera) for image in before.images}
+    loaded = load_model(trained_job.stage("train") / "model.zip")
+    deltas = loaded.model.cameras_delta.tangent.numpy()
+    row = 0
+    for image in after.images:
+        pose = np.asarray(image.world_from_camera)
+        if image.split == "test":
+            np.testing.assert_array_equal(pose, raw[image.file])
+            continue
+        moved = (pose[:, 3] - raw[image.file][:, 3]) * loaded.scene.scale
+        np.testing.assert_allclose(moved, deltas[row, :3], atol=1e-6)
+        np.testing.assert_allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-6)
+        row += 1
+    assert row == 15
+    assert after.cameras == before.cameras
+    assert "training" in after.notes
+
+
+def test_previews_are_small_pictures_of_training(trained_job: Workspace) -> None:
+    names = sorted(path.name for path in (trained_job.stage("train") / "previews").iterdir())
+    assert names == ["step_000030.jpg", "step_000060.jpg"]
+    with Image.open(trained_job.stage("train") / "previews" / names[0]) as picture:
+        assert picture.size == (36, 64)
+
+
+def test_a_cancel_ends_training_at_the_next_step(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=8)
+    messages: list[str] = []
+    hooks = RunHooks(
+        on_progress=lambda fraction, message, eta_s: messages.append(message),
+        is_cancelled=lambda: any(message.startswith("step 3/") for message in messages),
+    )
+    with pytest.raises(Cancelled):
+        tiny_job.run_with(workspace, "train", hooks)
+    assert messages[-1].startswith("step 3/60, ")
+    assert messages[-1].endswith(" dB")
+    assert not workspace.stage("train").exists()
+
+
+def test_a_lost_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job")
+    _leave_checkpoint(workspace)
+    steps: list[int] = []
+    saved: list[bool] = []
+
+    def on_progress(fraction: float, message: str, eta_s: float | None) -> None:
+        if message.startswith("step"):
+            steps.append(int(message.split()[1].split("/")[0]))
+
+    hooks = RunHooks(on_progress=on_progress, on_checkpoint=lambda: saved.append(True))
+    manifest = tiny_job.run_with(workspace, "train", hooks, max_steps=30)
+    assert steps[0] == 21
+    assert manifest["summary"]["num_steps"] == 30
+    assert saved
+
+
+def _leave_checkpoint(workspace: Workspace) -> None:
+    """Run 20 steps and keep their checkpoint, as a worker that dies right after saving does."""
+    copy = workspace.root / "kept"
+
+    def keep() -> None:
+        copy.mkdir(exist_ok=True)
+        for path in workspace.checkpoint("train").iterdir():
+            (copy / path.name).write_bytes(path.read_bytes())
+
+    tiny_job.run_with(workspace, "train", RunHooks(on_checkpoint=keep), max_steps=20)
+    workspace.checkpoint("train").mkdir(parents=True, exist_ok=True)
+    for path in copy.iterdir():
+        path.rename(workspace.checkpoint("train") / path.name)
+
+
+def test_a_damaged_checkpoint_costs_time_and_not_the_job(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job")
+    workspace.checkpoint("train").mkdir(parents=True)
+    (workspace.checkpoint("train") / "training.pt").write_bytes(b"half a file")
+    assert tiny_job.run(workspace, "train", max_steps=3)["summary"]["num_steps"] == 3
+
+
+def test_too_few_images_are_an_error_with_advice(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=3)
+    with pytest.raises(TrainingError, match="3 posed images") as caught:
+        tiny_job.run(workspace, "train")
+    assert caught.value.code == "too_few_images"
+    assert caught.value.hint
+
+
+def test_an_image_that_does_not_decode_is_named(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=6)
+    (workspace.stage("ingest") / "images" / "frame_00002.png").write_bytes(b"not a picture")
+    with pytest.raises(TrainingError, match=r"frame_00002\.png") as caught:
+        tiny_job.run(workspace, "train")
+    assert caught.value.code == "bad_image"
