@@ -30,7 +30,7 @@ from api.cli_display import (
     transfer_bar,
     watch_job,
 )
-from api.client import ApiProblem, Client, ConnectionFailed, Job, JobFailed, NerfworksError
+from api.client import RETRY_S, ApiProblem, Client, ConnectionFailed, Job, JobFailed, NerfworksError
 
 __all__ = ["main", "print_results", "watch_job"]
 
@@ -261,7 +261,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = _parser().parse_args(given)
     console, errors = Console(), Console(stderr=True)
     try:
-        with Client(args.url) as client:
+        with Client(args.url, retry_s=RETRY_S) as client:
             status_code: int = args.run(client, args, console)
             return status_code
     except UsageError as error:

@@ -49,6 +49,7 @@ from api.client_wire import (
 )
 
 __all__ = [
+    "RETRY_S",
     "ApiProblem",
     "Artifact",
     "Capture",

@@ -129,7 +129,7 @@ class Download:
                 start = 0
             with self.part.open("ab" if start else "wb") as file:
                 done = start
-                for chunk in answer.iter_raw(CHUNK_BYTES):
+                for chunk in answer.iter_raw():
                     file.write(chunk)
                     done += len(chunk)
                     if self._progress is not None:

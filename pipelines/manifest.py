@@ -20,8 +20,8 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class RunHooks:
     on_progress: ProgressSink = _ignore_progress
     is_cancelled: Callable[[], bool] = _never
     on_checkpoint: Callable[[], None] = _ignore
-    logger: logging.Logger = logging.getLogger("nerfworks.stage")  # noqa: RUF009  one per process
+    logger: logging.Logger = field(default_factory=lambda: logging.getLogger("nerfworks.stage"))
 
 
 def _digest(value: Any) -> str:
@@ -229,7 +229,7 @@ def _publish(out: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def _translated(stage: Stage) -> Any:
+def _translated(stage: Stage) -> Iterator[None]:
     """Turn what the machine lacks into errors that say so."""
     try:
         yield

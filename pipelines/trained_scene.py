@@ -1,7 +1,7 @@
 """A trained model with its cameras, in world units: what every stage behind `train` works with.
 
 `TrainedScene.load` needs `model.zip` alone, no capture. Poses are `world_from_camera` [3, 4],
-OpenGL, world frame; pictures are uint8 sRGB. Errors of `pipelines.nerf` leave here as pipeline errors.
+OpenGL, world frame; pictures are uint8 sRGB. Errors of `pipelines.nerf` leave here as ours.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -93,11 +93,10 @@ class S3ObjectStore:
         if length == 0:
             return
         end = "" if length is None else str(start + length - 1)
+        part = {} if start == 0 and length is None else {"Range": f"bytes={start}-{end}"}
         with _translated(key):
-            answer = self._client.get_object(
-                Bucket=self._bucket, Key=self._full(key), Range=f"bytes={start}-{end}"
-            )
-            with answer["Body"] as body:
+            answer = self._client.get_object(Bucket=self._bucket, Key=self._full(key), **part)
+            with closing(answer["Body"]) as body:
                 yield from body.iter_chunks(CHUNK_BYTES)
 
     def stat(self, key: str) -> ObjectStat:

@@ -11,9 +11,9 @@ from sqlalchemy.orm import Session
 from storage.db import Database
 from storage.jobs import StageSeed, create_job
 from storage.keys import capture_content
-from storage.migrations import upgrade
 from storage.models import Capture, Job, StageRow, new_id
 from storage.records import create_capture
+from storage.schema import upgrade
 
 LINE = (StageSeed("first", ()), StageSeed("second", ("first",)), StageSeed("third", ("second",)))
 DIAMOND = (

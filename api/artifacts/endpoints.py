@@ -48,7 +48,8 @@ def download_artifact(job_id: str, name: str, services: ServicesDep, request: Re
     """The bytes (`Range`, `ETag`), or a redirect to a signed URL of the object store."""
     with services.database.read_scope() as session:
         found = service.find(queries.get_job(session, job_id, manifests=True), name)
-    if not isinstance(services.store, LocalObjectStore):
+    is_local = isinstance(services.store, LocalObjectStore)
+    if request.method == "GET" and not is_local:  # a presigned URL is good for GET alone
         return RedirectResponse(
             service.signed_url(services, found, request),
             status_code=307,

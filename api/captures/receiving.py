@@ -84,10 +84,12 @@ class Received:
 def staging_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
     """A locked file that is gone when the block ends, unless it was moved away."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{secrets.token_hex(16)}{SUFFIX}"
+    name = secrets.token_hex(16)
+    unlocked, path = folder / f"{name}.new", folder / f"{name}{SUFFIX}"
     try:
-        with path.open("xb", buffering=0) as file:
+        with unlocked.open("xb", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)
+            unlocked.rename(path)  # `sweep` looks at this name only, so never at an unlocked file
             yield path, file
     finally:
         path.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipelines.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.captures.archive_rules import shown
-from pipelines.captures.pictures import PictureWriter, store_all
+from pipelines.captures.pictures import Picture, PictureWriter, store_all
 from pipelines.captures.record import Found
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -164,34 +164,12 @@ def write_posed(
             [item.name for item in sources],
             lambda done: ctx.progress(done / len(sources), f"Picture {done} of {len(sources)}"),
         )
-        cameras: dict[Intrinsics, int] = {}
-        images: list[PosedImage] = []
-        for item in sources:
-            picture = pictures.get(item.name)
-            if picture is None:
-                continue
-            lens = checked_lens(item.lens(picture.width, picture.height), f'"{shown(item.name)}"')
-            mask = None
-            if item.mask is not None:
-                mask = writer.store_mask(
-                    item.mask, len(images) + 1, (picture.width, picture.height)
-                )
-            images.append(
-                PosedImage(
-                    file=picture.file,
-                    camera=cameras.setdefault(lens, len(cameras)),
-                    world_from_camera=tuple(
-                        tuple(float(value) for value in row) for row in item.world_from_camera
-                    ),
-                    timestamp_s=item.timestamp_s,
-                    mask=mask,
-                )
-            )
+        cameras, images = _placed(writer, sources, pictures)
     finally:
         writer.close()
     CamerasFile(
-        cameras=tuple(cameras),
-        images=tuple(images),
+        cameras=cameras,
+        images=images,
         metric=metric,
         source=source,
         notes=dict(notes),
@@ -201,6 +179,36 @@ def write_posed(
         details={"num_posed": len(images), "num_lenses": len(cameras), "metric": metric},
         warnings=warnings,
     )
+
+
+def _placed(
+    writer: PictureWriter, sources: Sequence[PosedSource], pictures: Mapping[str, Picture]
+) -> tuple[tuple[Intrinsics, ...], tuple[PosedImage, ...]]:
+    """The lenses, each once, and the posed images of the pictures that were written."""
+    cameras: dict[Intrinsics, int] = {}
+    images: list[PosedImage] = []
+    for item in sources:
+        picture = pictures.get(item.name)
+        if picture is None:
+            continue
+        what = f'"{shown(item.name)}"'
+        lens = checked_lens(item.lens(picture.width, picture.height), what)
+        mask = None
+        if item.mask is not None:
+            size = (picture.width, picture.height)
+            mask = writer.store_mask(item.mask, len(images) + 1, size)
+        images.append(
+            PosedImage(
+                file=picture.file,
+                camera=cameras.setdefault(lens, len(cameras)),
+                world_from_camera=tuple(
+                    tuple(float(value) for value in row) for row in item.world_from_camera
+                ),
+                timestamp_s=item.timestamp_s,
+                mask=mask,
+            )
+        )
+    return tuple(cameras), tuple(images)
 
 
 def some_of(names: Iterable[str], most: int = 5) -> str:

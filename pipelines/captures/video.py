@@ -97,6 +97,8 @@ def read(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
             code="video_truncated",
             hint="Upload the file again; it was not copied or recorded to its end.",
         )
+    ctx.progress(0.7, "Decoding the first frames")
+    _try_decoding(path, ctx)
     num_frames = len(packets.times_s)
     if num_frames < MIN_FRAMES:
         raise CaptureError(
@@ -111,8 +113,6 @@ def read(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
             code="video_too_long",
             hint="Cut the video, or raise ingest.max_duration_s.",
         )
-    ctx.progress(0.7, "Decoding the first frames")
-    _try_decoding(path, ctx)
     fps = info.fps or (num_frames / duration_s if duration_s > 0 else None)
     info = replace(info, num_frames=num_frames, duration_s=round(duration_s, 6), fps=fps)
     return Found(video=info.as_dict(), details=_details(info, packets), warnings=_warnings(info))

@@ -105,11 +105,11 @@ def filter_chain(plan: DecodePlan) -> str:
     parts.append("showinfo@kept=checksum=0")
     parts.append(f"scale={plan.width}:{plan.height}:flags=bicubic+accurate_rnd")
     if plan.hdr in _HDR_TRANSFER and can_tone_map():
-        # npl is the brightness of SDR white in the HDR signal (BT.2408: 203 cd/m2).
-        parts.append(
-            f"zscale=tin={_HDR_TRANSFER[plan.hdr]}:pin=bt2020:min=bt2020nc:t=linear:npl=203"
-        )
-        parts.append("format=gbrpf32le,zscale=p=bt709,tonemap=mobius:param=0.7:desat=0")
+        # npl: brightness of SDR white in the HDR signal, 203 cd/m2 (ITU-R BT.2408).
+        # Some phones tag the transfer alone; zscale finds no way where the rest is unknown.
+        tags = f"colorspace=bt2020nc:color_primaries=bt2020:color_trc={_HDR_TRANSFER[plan.hdr]}"
+        parts.append(f"setparams={tags},zscale=t=linear:npl=203,format=gbrpf32le")
+        parts.append("zscale=p=bt709,tonemap=mobius:param=0.7:desat=0")
         parts.append("zscale=t=iec61966-2-1:m=170m:r=full,format=yuv420p")
     else:
         parts.append("scale=out_color_matrix=bt601:out_range=full,format=yuv420p")

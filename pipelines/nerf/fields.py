@@ -103,9 +103,12 @@ class NerfactoField(nn.Module):
         self.density_mlp = MLP(self.grid.num_outputs, config.hidden_dim, 1 + config.geo_feature_dim)
         inputs = NUM_SPHERICAL_HARMONICS + config.geo_feature_dim + config.appearance_dim
         self.color_mlp = MLP(inputs, config.hidden_dim_color, config.hidden_dim_color, 3)
-        self.appearance = (
-            nn.Embedding(num_images, config.appearance_dim) if config.appearance_dim else None
-        )
+        self.appearance: nn.Embedding | None = None
+        if config.appearance_dim:
+            self.appearance = nn.Embedding(num_images, config.appearance_dim)
+            # nerfstudio starts with normal numbers; their mean, which renders new views, is then a
+            # code unlike any that was trained. From zero, codes part only as the photos differ.
+            nn.init.zeros_(self.appearance.weight)
 
     def density(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Density [...] per scene unit and geometry features [..., G] at scene points [..., 3]."""

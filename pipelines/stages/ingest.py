@@ -6,7 +6,6 @@ Writes `capture.json` (always), `images/` (photos and app exports), `masks/` and
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from pipelines.captures.archive_rules import ArchiveLimits
 from pipelines.captures.record import CaptureRecord, Found
 from pipelines.captures.sniff import Sniffed, sniff
 from pipelines.errors import CaptureError
+from pipelines.manifest import file_sha256
 from pipelines.options import IngestOptions
 from pipelines.stage import StageContext
 
@@ -45,7 +45,7 @@ def run(options: IngestOptions, ctx: StageContext) -> dict[str, Any]:
     record = CaptureRecord(
         kind=found_kind.kind,
         filename=filename,
-        sha256=sha256_of(path),
+        sha256=file_sha256(path),
         num_images=len(found.images),
         video=found.video,
         images=found.images,
@@ -85,9 +85,3 @@ def _what(record: CaptureRecord) -> str:
     if record.video is None:
         return f"{record.num_images} pictures"
     return f"{record.video['num_frames']} frames, {record.video['duration_s']:.1f} s"
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

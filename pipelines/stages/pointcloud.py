@@ -33,7 +33,7 @@ _geometry: Any = open3d.geometry
 _utility: Any = open3d.utility
 
 _MAX_VIEWS = 48
-_MIN_LONG_SIDE, _MAX_LONG_SIDE = 96, 4096
+_MIN_LONG_SIDE, _MAX_LONG_SIDE = 64, 4096
 _OVERSAMPLING = 1.5
 _MIN_VALID_SHARE = 0.05
 _DEPTH_TOLERANCE = 0.05
@@ -131,8 +131,9 @@ def consistent(cloud: Cloud, views: Iterable[DepthView]) -> NDArray[np.bool_]:
     """Which points the views do not contradict: [P].
 
     A view contradicts a point that hangs in front of the surface it sees by more than 5 %, and
-    supports one on that surface. Points behind it are hidden and say nothing. A point goes when at
-    least two views, and more than 30 % of those with a say, contradict it.
+    supports one on that surface. The nearest surface around the pixel counts, or edges would be
+    eaten away by the background beside them. Points behind it are hidden and say nothing. A point
+    goes when at least two views, and more than 30 % of those with a say, contradict it.
     """
     contradicted = np.zeros(len(cloud), np.int32)
     supported = np.zeros(len(cloud), np.int32)
@@ -146,14 +147,25 @@ def consistent(cloud: Cloud, views: Iterable[DepthView]) -> NDArray[np.bool_]:
         v = np.floor(lens.fl_y * local[:, 1] / safe + lens.cy)
         inside = (z > 1e-9) & (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)
         seen = np.flatnonzero(inside)
-        surface = view.z_depth[v[seen].astype(int), u[seen].astype(int)]
-        known = surface > 0
+        surface = _nearest_around(view.z_depth)[v[seen].astype(int), u[seen].astype(int)]
+        known = np.isfinite(surface)
         seen, surface = seen[known], surface[known]
         contradicted[seen] += z[seen] < surface * (1.0 - _DEPTH_TOLERANCE)
         supported[seen] += np.abs(z[seen] - surface) <= surface * _DEPTH_TOLERANCE
     bad = (contradicted >= 2) & (contradicted > _MAX_CONTRADICTED * (contradicted + supported))
     fine: NDArray[np.bool_] = ~bad
     return fine
+
+
+def _nearest_around(z_depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[H, W] the least known depth in each pixel's 3x3 neighbourhood; infinite where none is."""
+    height, width = z_depth.shape
+    padded = np.pad(
+        np.where(z_depth > 0, z_depth, np.float32(np.inf)), 1, constant_values=np.float32(np.inf)
+    )
+    shifted = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    nearest: NDArray[np.float32] = np.minimum.reduce(shifted)
+    return nearest
 
 
 def _inliers(cloud: Cloud, bounds: SceneBounds) -> NDArray[np.int64]:

@@ -240,5 +240,5 @@ class Reconstructor:
         except (RuntimeError, ValueError, IndexError) as error:
             raise ToolError(
                 f"COLMAP failed while {what} of {len(self.names)} images.",
-                details={"log": str(error)[-2000:]},
+                details={"log": str(error).splitlines()[-20:]},
             ) from error

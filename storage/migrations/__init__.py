@@ -1,31 +1,3 @@
-"""The schema's history, and `upgrade`, which brings a database up to date.
+from storage.schema import upgrade
 
-Run from code, so that it works from an installed wheel: no alembic.ini is needed.
-"""
-
-from __future__ import annotations
-
-from pathlib import Path
-
-from alembic import command
-from alembic.config import Config
-from sqlalchemy import text
-
-from storage.db import make_engine
-
-_LOCK = 0x6E657266  # any number of our own: one upgrade at a time on PostgreSQL
-
-
-def upgrade(database_url: str) -> None:
-    """Bring the schema to the newest revision. Safe to call from several processes at once."""
-    engine = make_engine(database_url)
-    try:
-        with engine.begin() as connection:  # BEGIN IMMEDIATE on SQLite: others wait
-            if connection.dialect.name == "postgresql":
-                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
-            config = Config()
-            config.set_main_option("script_location", str(Path(__file__).parent).replace("%", "%%"))
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
-    finally:
-        engine.dispose()
+__all__ = ["upgrade"]

@@ -75,7 +75,7 @@ def finished_runs(embedded: Embedded, job_id: str) -> Counter[str]:
     engine = create_engine(embedded.environment()["NERFWORKS_DATABASE_URL"])
     with engine.connect() as connection:
         rows = connection.execute(
-            text("select stage from events where job_id = :job and kind = 'stage_succeeded'"),
+            text("select stage from events where job_id = :job and kind = 'stage.succeeded'"),
             {"job": job_id},
         )
         return Counter(row[0] for row in rows)

@@ -15,12 +15,12 @@ from typing import Any
 from storage.db import Database
 from storage.jobs import StageSeed, create_job, ready_stage_ids, request_cancel
 from storage.keys import capture_content
-from storage.migrations import upgrade
 from storage.models import Job, StageRow, new_id
 from storage.objects import ObjectStore, open_object_store
 from storage.queries import get_job
 from storage.queue import Bell
 from storage.records import create_capture, read_logs
+from storage.schema import upgrade
 from storage.settings import StorageSettings
 from tests.integration.toy_stages import STAGES
 

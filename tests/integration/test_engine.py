@@ -263,6 +263,6 @@ def test_a_worker_consumes_again_after_redis_was_killed_and_started(
             redis_server.start()
             time.sleep(3)
             second = engine.submit({})
-            assert engine.wait_for(second, "succeeded", "failed", timeout_s=30)
+            assert engine.wait_for(second, "succeeded", "failed", timeout_s=30).state == "succeeded"
     finally:
         engine.close()

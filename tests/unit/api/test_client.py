@@ -344,7 +344,7 @@ def test_client_loads_no_server_code() -> None:
     program = (
         "import sys, nerfworks; print(*sorted({name.split('.')[0] for name in sys.modules} & "
         "{'fastapi', 'starlette', 'sqlalchemy', 'celery', 'boto3', 'storage', 'pipelines', "
-        "'worker', 'rich', 'torch', 'numpy'}))"
+        "'worker', 'torch', 'numpy'}))"
     )
     loaded = subprocess.run(
         [sys.executable, "-c", program], check=True, capture_output=True, text=True, cwd=ROOT

@@ -39,7 +39,7 @@ def images(cameras: Cameras) -> ImageData:
 
 @pytest.fixture(scope="module")
 def trained(images: ImageData, cameras: Cameras) -> Nerfacto:
-    config = tiny_config(max_steps=150)
+    config = tiny_config(max_steps=200, rays_per_step=512, engine="fast")
     config = replace(config, model=replace(config.model, camera_mode="off"))
     indices = [index for index in range(len(cameras)) if index != HELD_OUT]
     return train(images, cameras, indices, config, seed=0)

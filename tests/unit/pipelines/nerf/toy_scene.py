@@ -32,7 +32,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(back, right), back, eye], axis=-1)
 
 
-def toy_cameras(num: int = 12) -> Cameras:
+def toy_cameras(num: int = 24) -> Cameras:
     """A ring of pinhole cameras around the ball, at two heights."""
     poses = []
     for index in range(num):
@@ -82,8 +82,9 @@ def tiny_config(**changes: object) -> TrainConfig:
         hidden_dim=32,
         hidden_dim_color=32,
         appearance_dim=4,
+        # Few steps are not enough to bring matter in from the far end, where 0.01 leaves it.
+        average_init_density=1.0,
         anneal_steps=40,
-        proposal_warmup_steps=50,
     )
     values: dict[str, object] = {
         "max_steps": 80,
@@ -92,6 +93,6 @@ def tiny_config(**changes: object) -> TrainConfig:
         "engine": "plain",
         "model": model,
         "data": DataConfig(long_side_px=SIZE),
-        "optimizer": OptimizerConfig(decay_steps=100),
+        "optimizer": OptimizerConfig(decay_steps=1000),
     }
     return TrainConfig(**{**values, **changes})  # type: ignore[arg-type]

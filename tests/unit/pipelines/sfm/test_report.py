@@ -101,7 +101,7 @@ def test_enough_is_enough() -> None:
 
 def test_tiny_angles_are_no_parallax() -> None:
     found = model(tuple(range(20)), angle_deg=1.7)
-    with pytest.raises(PosesError, match="1.7 degrees") as caught:
+    with pytest.raises(PosesError, match=r"1\.7 degrees") as caught:
         check_usable(outcome([found]), film(20), PosesOptions())
     assert caught.value.code == "no_parallax"
 

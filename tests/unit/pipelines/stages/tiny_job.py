@@ -21,10 +21,10 @@ LONG_SIDE = 64
 _GRID = {"num_levels": 4, "log2_table_size": 12, "max_res": 64}
 OPTIONS: dict[str, Any] = {
     "train": {
-        "max_steps": 60,
+        "max_steps": 200,
         "rays_per_step": 512,
         "device": "cpu",
-        "preview_every_steps": 30,
+        "preview_every_steps": 100,
         "model": {
             "num_proposal_samples": [32],
             "num_nerf_samples": 16,
@@ -33,7 +33,7 @@ OPTIONS: dict[str, Any] = {
             "hidden_dim": 32,
             "hidden_dim_color": 32,
             "appearance_dim": 4,
-            "anneal_steps": 20,
+            "anneal_steps": 50,
         },
         "data": {"long_side_px": LONG_SIDE},
     },

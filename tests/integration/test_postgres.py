@@ -1,0 +1,136 @@
+"""The records on a real PostgreSQL: locks, clocks, JSON; and a whole toy job beside real S3."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from sqlalchemy.orm import Session
+
+from storage.db import Database, now
+from storage.jobs import StageSeed, delete_job, stage_id
+from storage.leases import claim_stage, reap_expired, succeed_stage
+from storage.queries import get_job, list_jobs
+from storage.records import append_logs, read_logs
+from storage.schema import upgrade
+from tests.factories import make_capture, make_job, states
+from tests.integration.engine import Engine
+from tests.services import RedisServer, S3Endpoint
+
+pytestmark = pytest.mark.services
+
+
+@pytest.fixture
+def database(postgres_url: str) -> Iterator[Database]:
+    upgrade(postgres_url)
+    made = Database(postgres_url)
+    yield made
+    made.dispose()
+
+
+def test_one_of_many_claims_at_once_wins(database: Database) -> None:
+    with database.session_scope() as session:
+        stage = stage_id(make_job(session).id, "first")
+
+    def attempt(number: int) -> bool:
+        with database.session_scope() as session:
+            return claim_stage(session, stage, f"w{number}", 60.0) is not None
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(attempt, range(16))) == 1
+
+
+def test_siblings_that_end_at_once_still_unblock_what_waits_for_both(database: Database) -> None:
+    stages = (
+        *(StageSeed(f"side{number}", ()) for number in range(6)),
+        StageSeed("last", tuple(f"side{number}" for number in range(6))),
+    )
+    for _ in range(5):
+        with database.session_scope() as session:
+            job = make_job(session, stages).id
+        claims = []
+        for number in range(6):
+            with database.session_scope() as session:
+                claims.append(claim_stage(session, stage_id(job, f"side{number}"), "w", 60.0))
+
+        def end(claim: object) -> list[str]:
+            with database.session_scope() as session:
+                return succeed_stage(session, claim, manifest={}, output_prefix="p/")  # type: ignore[arg-type]
+
+        with ThreadPoolExecutor(6) as pool:
+            ready = [key for keys in pool.map(end, claims) for key in keys]
+        assert ready == [stage_id(job, "last")]
+
+
+def test_leases_go_by_the_database_s_clock(database: Database) -> None:
+    with database.session_scope() as session:
+        assert abs((now(session) - datetime.now(UTC)).total_seconds()) < 60
+        job = make_job(session).id
+        claim = claim_stage(session, stage_id(job, "first"), "w", -1.0)
+        assert claim is not None
+        assert reap_expired(session) == [claim.stage_id]
+
+
+def test_values_and_labels_that_postgresql_is_strict_about(database: Database) -> None:
+    with database.session_scope() as session:
+        options = {"first": {"bad": float("inf"), "text": "a\x00b\ud800"}}
+        job = make_job(session, labels={"colour": "red"}, options=options).id  # type: ignore[arg-type]
+        claim = claim_stage(session, stage_id(job, "first"), "w", 60.0)
+        assert claim is not None
+        append_logs(session, claim, ["nul \x00", "half \ud800"])
+    with database.read_scope() as session:
+        assert get_job(session, job).options["first"] == {"bad": None, "text": "ab?"}
+        assert read_logs(session, job).lines == ["nul ", "half ?"]
+        assert [found.id for found in list_jobs(session, label="colour=red")[0]] == [job]
+        assert list_jobs(session, label="colour=blue")[0] == []
+
+
+def test_pages_and_deletion(database: Database) -> None:
+    with database.session_scope() as session:
+        capture = make_capture(session)
+        ids = [make_job(session, capture=capture).id for _ in range(5)]
+    seen: list[str] = []
+    cursor = None
+    with database.read_scope() as session:
+        for _ in range(3):
+            page, cursor = list_jobs(session, limit=2, cursor=cursor)
+            seen += [job.id for job in page]
+    assert sorted(seen) == sorted(ids)
+    assert cursor is None
+    with database.session_scope() as session:
+        delete_job(session, ids[0])
+        assert len(list_jobs(session)[0]) == 4
+
+
+def last_state(session: Session, job: str) -> str:
+    return states(session, job)["job"]
+
+
+def test_a_job_on_postgresql_and_s3_with_two_workers_in_two_homes(
+    tmp_path: Path, redis_server: RedisServer, postgres_url: str, s3_endpoint: S3Endpoint
+) -> None:
+    """The workers share nothing but the services, so inputs come through the object store."""
+    engine = Engine(
+        tmp_path,
+        redis_server.url,
+        NERFWORKS_DATABASE_URL=postgres_url,
+        **s3_endpoint.environment(),
+    )
+    try:
+        for number in (1, 2):
+            engine.environment["NERFWORKS_HOME"] = str(tmp_path / f"home{number}")
+            engine.start_worker(f"w{number}")
+        plan = {"mesh": {"steps": 10, "step_s": 0.2}, "video": {"steps": 10, "step_s": 0.2}}
+        job_id = engine.submit({**plan, "train": {"steps": 20, "step_s": 0.1, "save_every": 4}})
+        job = engine.wait_for(job_id, "succeeded", "failed", timeout_s=90)
+        assert job.state == "succeeded", job.error
+        pids = {line.split()[-1] for line in engine.notes("") if " start " in line}
+        assert len(pids) == 2, "mesh and video ran side by side"
+        report = engine.stage(job_id, "report").summary
+        assert report is not None
+        assert report["read"] == ["ingest", "train", "mesh", "video"]
+    finally:
+        engine.close()

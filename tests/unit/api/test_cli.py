@@ -1,0 +1,290 @@
+"""The command: its exit statuses, what it prints, and that it never shows a traceback."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from api import cli
+from api.cli_display import clean, duration, print_results, quality_rows, size, watch_job
+from api.client import Client
+from storage.jobs import stage_id
+from storage.leases import claim_stage, fail_stage, heartbeat
+from storage.records import append_logs
+from tests.services import free_port
+from tests.unit.api.conftest import (
+    KEY,
+    LEASE_S,
+    LiveServer,
+    finish_job,
+    run_stage,
+    zip_of_pictures,
+)
+
+ROOT = Path(__file__).resolve().parents[3]
+REPORT: dict[str, Any] = {
+    "capture": {"kind": "images"},
+    "poses": {"num_images": 50, "num_registered": 46, "registered_ratio": 0.92},
+    "metrics": {"psnr": 21.345, "ssim": 0.8123, "num_images": 5, "width": 480, "height": 270},
+    "timings": {"ingest_s": 1.2, "train_s": 605.0},
+}
+
+
+@pytest.fixture
+def command(live: LiveServer, monkeypatch: pytest.MonkeyPatch) -> LiveServer:
+    """A live server that the command finds through the environment."""
+    monkeypatch.setenv("NERFWORKS_URL", live.url)
+    monkeypatch.setenv("NERFWORKS_API_KEY", KEY)
+    monkeypatch.setenv("COLUMNS", "200")
+    return live
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    path = tmp_path / "garden.zip"
+    path.write_bytes(zip_of_pictures())
+    return path
+
+
+def newest(live: LiveServer) -> str:
+    with Client(live.url, KEY) as client:
+        return next(client.jobs()).id
+
+
+def when_submitted(live: LiveServer, do: Any) -> threading.Thread:
+    """Call `do(job id)` in a thread once there is a job."""
+
+    def run() -> None:
+        with Client(live.url, KEY) as client:
+            deadline = time.monotonic() + 20
+            while not (jobs := list(client.jobs())):
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+        do(jobs[0].id)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_submit_and_download_ends_with_files_and_tables(
+    command: LiveServer, archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def content(name: str) -> bytes:
+        return json.dumps(REPORT).encode() if name == "report.json" else f"this is {name}".encode()
+
+    thread = when_submitted(command, lambda job: finish_job(command.services, job, content))
+    out = tmp_path / "out"
+    arguments = ["submit", str(archive), "--preset", "preview", "--download", str(out)]
+    assert cli.main([*arguments, "--set", "train.max_steps=500", "--label", "a=b"]) == 0
+    thread.join()
+    printed = capsys.readouterr().out
+    assert (out / "mesh.glb").read_bytes() == b"this is mesh.glb"
+    for text in ("train", "succeeded", "any glTF viewer", "21.3", "46 of 50", "10 m 05"):
+        assert text in printed, printed
+    with Client() as client:
+        job = client.get_job(newest(command))
+    assert job.options["train"]["max_steps"] == 500
+    assert job.labels == {"a": "b"}
+
+
+def test_failed_job_is_exit_status_1_with_its_advice(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(job: str) -> None:
+        with command.services.database.session_scope() as session:
+            claim = claim_stage(session, stage_id(job, "ingest"), "test", LEASE_S)
+            assert claim is not None
+            error = {"code": "no_parallax", "message": "Nothing moved.", "hint": "Walk around."}
+            fail_stage(session, claim, error, retryable=False)
+
+    when_submitted(command, fail)
+    assert cli.main(["submit", str(archive), "--wait"]) == 1
+    printed = capsys.readouterr().out
+    assert "Nothing moved." in printed
+    assert "Walk around." in printed
+    assert cli.main(["status"]) == 1
+    assert "no_parallax" in capsys.readouterr().out
+
+
+def test_status_list_logs_cancel_delete_and_presets(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["submit", str(archive)]) == 0
+    job = newest(command)
+    assert job in capsys.readouterr().out
+    services = command.services
+    with services.database.session_scope() as session:
+        claim = claim_stage(session, stage_id(job, "ingest"), "test", LEASE_S)
+        assert claim is not None
+        heartbeat(session, claim, LEASE_S, progress=0.5, message="photo 2/4", eta_s=70)
+        append_logs(session, claim, ["first", "second [red]\x1b[31m line"])
+    assert cli.main(["status", job]) == 0
+    shown = capsys.readouterr().out
+    assert "50%" in shown
+    assert "1 m 10 s left" in shown
+    assert cli.main(["logs", job, "--line", "-1", "--stage", "ingest"]) == 0
+    assert capsys.readouterr().out == "second [red] [31m line\n"
+    assert cli.main(["list", "--state", "running"]) == 0
+    assert "ingest 50%" in capsys.readouterr().out
+    assert cli.main(["cancel", job]) == 0
+    assert "cancelling" in capsys.readouterr().out
+    assert cli.main(["delete", job]) == 1
+    assert "cancel it first" in capsys.readouterr().err
+    assert cli.main(["presets"]) == 0
+    assert "preview" in capsys.readouterr().out
+
+
+def test_logs_follow_until_the_job_is_over(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cli.main(["submit", str(archive)])
+    job = newest(command)
+    services = command.services
+
+    def write() -> None:
+        time.sleep(0.5)
+        with services.database.session_scope() as session:
+            claim = claim_stage(session, stage_id(job, "ingest"), "test", LEASE_S)
+            assert claim is not None
+            append_logs(session, claim, ["late line"])
+            fail_stage(session, claim, {"code": "x", "message": "m", "hint": "h"}, retryable=False)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    assert cli.main(["logs", job, "--follow"]) == 0
+    thread.join()
+    assert capsys.readouterr().out.count("late line") == 1
+
+
+def test_download_goes_to_a_folder_of_the_job(
+    command: LiveServer, archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cli.main(["submit", str(archive)])
+    job = newest(command)
+    finish_job(command.services, job, lambda name: b"x")
+    assert cli.main(["download"]) == 0
+    assert (tmp_path / "out" / job / "video.mp4").read_bytes() == b"x"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["submit", "no-such-file.mp4"],
+        ["submit", "{archive}", "--set", "train.max_steps"],
+        ["submit", "{archive}", "--label", "novalue"],
+    ],
+)
+def test_wrong_usage_is_exit_status_2(
+    command: LiveServer, archive: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([text.format(archive=archive) for text in arguments]) == 2
+    assert capsys.readouterr().err
+    with Client() as client:
+        assert list(client.captures()) == []
+
+
+def test_unknown_command_is_exit_status_2() -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["paint"])
+    assert caught.value.code == 2
+
+
+def test_refusals_name_each_wrong_option(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["submit", str(archive), "--set", "train.max_stepz=1"]) == 1
+    shown = capsys.readouterr().err
+    assert "train.max_stepz" in shown
+    assert "Traceback" not in shown
+
+
+def test_service_that_is_away_is_exit_status_3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("NERFWORKS_URL", "NERFWORKS_API_KEY", "NERFWORKS_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["list"]) == 3
+    assert "make up" in capsys.readouterr().err
+    monkeypatch.setattr(cli, "RETRY_S", 0.2)
+    assert cli.main(["--url", f"http://127.0.0.1:{free_port()}", "list"]) == 3
+    assert "cannot be reached" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_watching_leaves_the_job_running(command: LiveServer, archive: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "nerfworks", "submit", str(archive), "--wait"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+
+    def begin(job: str) -> None:
+        run_stage(command.services, job, "ingest", {})
+        time.sleep(1.5)
+        process.send_signal(signal.SIGINT)
+
+    when_submitted(command, begin)
+    out, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "The job goes on" in out
+    assert "Traceback" not in out + errors
+    with Client() as client:
+        assert client.get_job(newest(command)).state == "running"
+
+
+def test_bars_are_drawn_for_each_stage_on_a_terminal(command: LiveServer, archive: Path) -> None:
+    with Client() as client:
+        job = client.create_job(client.upload(archive).id)
+        when_submitted(command, lambda job: finish_job(command.services, job, lambda _: b"x"))
+        screen = io.StringIO()
+        console = Console(file=screen, force_terminal=True, width=120)
+        assert watch_job(client, job.id, console).state == "succeeded"
+    for stage in job.stages:
+        assert stage.name in screen.getvalue()
+
+
+def test_results_show_what_was_not_measured(tmp_path: Path) -> None:
+    rows = dict(quality_rows({"metrics": {"psnr": None, "ssim": None, "num_images": 0}}))
+    assert rows["held-out PSNR"] == rows["held-out SSIM"] == "not measured"
+    assert dict(quality_rows(REPORT))["images registered"] == "46 of 50 (92%)"
+    assert dict(quality_rows(REPORT))["held-out images"] == "5, 480 x 270 px"
+    assert print_results.__module__ == "api.cli_display"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.4, "0 s"), (59.6, "1 m 00 s"), (125, "2 m 05 s"), (3725, "1 h 02 m"), (-3, "0 s")],
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_sizes_read_well() -> None:
+    assert [size(0), size(999), size(1500), size(2_500_000_000)] == [
+        "0 B",
+        "999 B",
+        "1.5 kB",
+        "2.5 GB",
+    ]
+
+
+def test_text_of_a_service_cannot_steer_the_terminal() -> None:
+    screen = io.StringIO()
+    Console(file=screen, width=80).print(clean("a\x1b[31mb [bold]c\r\nd"), highlight=False)
+    assert screen.getvalue() == "a [31mb [bold]c  d\n"

@@ -1,0 +1,110 @@
+"""The real samples, with the quirks that their README lists; needs NERFWORKS_CAPTURES."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from pipelines.cameras_file import CamerasFile
+from pipelines.captures.sniff import sniff
+from pipelines.manifest import run_job_locally
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.captures.archives import write_zip
+
+pytestmark = [
+    pytest.mark.captures,
+    pytest.mark.skipif(
+        "NERFWORKS_CAPTURES" not in os.environ,
+        reason="NERFWORKS_CAPTURES does not name the folder of real captures",
+    ),
+]
+
+
+def captures() -> Path:
+    return Path(os.environ["NERFWORKS_CAPTURES"])
+
+
+def zip_of(target: Path, folder: Path, files: Iterable[Path]) -> Path:
+    return write_zip(
+        target, {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}, 0
+    )
+
+
+def prepared(tmp_path: Path, source: Path) -> tuple[Workspace, dict[str, object]]:
+    """The workspace after `frames`, and what ingest said."""
+    workspace = Workspace(tmp_path / "job")
+    workspace.capture_file.parent.mkdir(parents=True)
+    workspace.capture_file.symlink_to(source)
+    kind = sniff(workspace.capture_file, source.name).kind
+    manifests = run_job_locally(workspace, "preview", {}, kind=kind, until="frames")
+    return workspace, manifests["ingest"]["summary"]
+
+
+def test_box_video_gives_frames_at_even_times(tmp_path: Path) -> None:
+    workspace, summary = prepared(tmp_path, captures() / "video-phone-box" / "box.mp4")
+    assert (summary["kind"], summary["width"], summary["height"]) == ("video", 960, 544)
+    listed = json.loads((workspace.stage("frames") / "frames.json").read_text())
+    assert (listed["num_source_frames"], len(listed["frames"])) == (698, 72)
+    times = np.array([row["timestamp_s"] for row in listed["frames"]])
+    indices = np.array([row["source_frame_index"] for row in listed["frames"]])
+    np.testing.assert_allclose(times, indices / 30, atol=0.5 / 30)
+    assert (np.floor(times / (698 / 30 / 72) + 1e-6) == np.arange(72)).all()
+
+
+def test_fox_poses_pair_with_the_files_that_are_there(tmp_path: Path) -> None:
+    folder = captures() / "photos-fox"
+    source = zip_of(tmp_path / "fox.zip", folder, [p for p in folder.rglob("*") if p.is_file()])
+    workspace, summary = prepared(tmp_path, source)
+    found = (summary["kind"], summary["num_images"], summary["num_missing"])
+    assert found == ("nerfstudio", 50, 17)
+    file = CamerasFile.load(workspace.posed_cameras)
+    (lens,) = file.cameras
+    assert (lens.model, lens.width, lens.height) == ("OPENCV", 1080, 1920)
+    listed = json.loads((folder / "transforms.json").read_text())["frames"]
+    poses = {frame["file_path"]: frame["transform_matrix"] for frame in listed}
+    record = json.loads((workspace.stage("ingest") / "capture.json").read_text())
+    for image, stored in zip(file.images, record["images"], strict=True):
+        assert image.file == stored["file"]
+        np.testing.assert_allclose(
+            image.world_from_camera, np.array(poses[stored["source"]])[:3], atol=1e-4
+        )
+
+
+def test_fox_photos_alone_are_images(tmp_path: Path) -> None:
+    folder = captures() / "photos-fox" / "images"
+    _, summary = prepared(tmp_path, zip_of(tmp_path / "fox.zip", folder, folder.iterdir()))
+    assert (summary["kind"], summary["num_images"]) == ("images", 50)
+
+
+def test_sceaux_photos_lose_their_exif(tmp_path: Path) -> None:
+    folder = captures() / "photos-sceaux-castle" / "images"
+    source = zip_of(tmp_path / "castle.zip", folder, folder.iterdir())
+    workspace, summary = prepared(tmp_path, source)
+    assert (summary["kind"], summary["num_images"]) == ("images", 11)
+    for path in (workspace.images_root / "images").iterdir():
+        with PIL.Image.open(path) as image:
+            assert image.size == (2832, 2128)
+            assert not image.getexif()
+
+
+def test_door_handle_skips_the_frame_that_is_missing(tmp_path: Path) -> None:
+    folder = captures() / "record3d-door-handle-first100"
+    source = zip_of(tmp_path / "door.zip", folder, [p for p in folder.rglob("*") if p.is_file()])
+    workspace, summary = prepared(tmp_path, source)
+    assert (summary["kind"], summary["num_images"], summary["num_poses"]) == ("record3d", 99, 100)
+    file = CamerasFile.load(workspace.posed_cameras)
+    record = json.loads((workspace.stage("ingest") / "capture.json").read_text())
+    numbers = [int(Path(image["source"]).stem) for image in record["images"]]
+    assert numbers == [n for n in range(100) if n != 60]
+    poses = json.loads((folder / "EXR_RGBD" / "metadata.json").read_text())["poses"]
+    centers = np.array([[row[3] for row in image.world_from_camera] for image in file.images])
+    expected = np.array([[poses[n][6], poses[n][4], poses[n][5]] for n in numbers])
+    np.testing.assert_allclose(centers, expected, atol=1e-9)
+    # The pictures show the floor at their lower edge: a camera's up is the world's up.
+    assert all(image.world_from_camera[2][1] > 0.5 for image in file.images)

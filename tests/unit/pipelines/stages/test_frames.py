@@ -1,0 +1,229 @@
+"""Real clips: the right frames are chosen, upright, with true times, in SDR."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from pipelines.captures.video_frames import Frame
+from pipelines.errors import Cancelled, CaptureError
+from pipelines.options import FramesOptions, IngestOptions, StageOptions
+from pipelines.stage import StageContext
+from pipelines.stages import frames, ingest
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.tools.clips import (
+    ffmpeg,
+    make_clip,
+    make_hdr_clip,
+    marked_pictures,
+    number_in,
+    rotated,
+)
+
+
+def context(root: Path, stage: str) -> StageContext:
+    workspace = Workspace(root)
+    out = workspace.stage(stage)
+    out.mkdir(parents=True)
+    return StageContext(stage, workspace, out, workspace.checkpoint(stage))
+
+
+def ingested(tmp_path: Path, clip: Path, options: StageOptions | None = None) -> dict[str, Any]:
+    ctx = context(tmp_path / "job", "ingest")
+    ctx.workspace.capture_file.parent.mkdir(parents=True)
+    clip.rename(ctx.workspace.capture_file)
+    return ingest.run(options or IngestOptions(), ctx)  # type: ignore[arg-type]
+
+
+def chosen(tmp_path: Path, **options: Any) -> tuple[dict[str, Any], list[dict[str, Any]], Path]:
+    """The stage's summary, the rows of frames.json, and the stage's folder."""
+    ctx = context(tmp_path / "job", "frames")
+    summary = frames.run(FramesOptions(**options), ctx)
+    rows = json.loads((ctx.out / "frames.json").read_text())["frames"]
+    assert len(rows) == summary["num_frames"] == len(list((ctx.out / "images").iterdir()))
+    return summary, rows, ctx.out
+
+
+def test_every_frame_is_used_where_fewer_are_there_than_wanted(tmp_path: Path) -> None:
+    ingested(tmp_path, make_clip(tmp_path / "a.mp4"))
+    summary, rows, _ = chosen(tmp_path, num_frames=300)
+    assert summary["num_frames"] == summary["num_source_frames"] == 60
+    assert [row["source_frame_index"] for row in rows] == list(range(60))
+    np.testing.assert_allclose([row["timestamp_s"] for row in rows], np.arange(60) / 30, atol=1e-4)
+
+
+@pytest.mark.parametrize("container", ["mp4", "mkv", "avi"])
+def test_sharp_frames_win_and_are_the_ones_they_are_said_to_be(
+    tmp_path: Path, container: str
+) -> None:
+    sharp = {3, 11, 17, 29, 33, 46, 52, 58}  # one in each eighth of 64 frames
+    marked_pictures(tmp_path / "p", 64, blurred=set(range(64)) - sharp)
+    clip = tmp_path / f"a.{container}"
+    ffmpeg("-framerate", "20", "-i", tmp_path / "p" / "%04d.png", "-pix_fmt", "yuv420p", clip)
+    ingested(tmp_path, clip)
+    _, rows, out = chosen(tmp_path, num_frames=8, candidates_per_frame=60)
+    assert [row["source_frame_index"] for row in rows] == sorted(sharp)
+    assert [number_in(out / row["file"]) for row in rows] == sorted(sharp)
+    times = [row["timestamp_s"] for row in rows]
+    np.testing.assert_allclose(times, np.array(sorted(sharp)) / 20, atol=0.5 / 20)
+
+
+def test_candidates_are_limited_and_even(tmp_path: Path) -> None:
+    ingested(tmp_path, make_clip(tmp_path / "a.mp4", "testsrc2=s=320x180:r=60:d=4"))
+    summary, rows, _ = chosen(tmp_path, num_frames=10, candidates_per_frame=3)
+    assert (summary["num_candidates"], summary["num_source_frames"]) == (30, 240)
+    windows = [int(row["timestamp_s"] / 0.4) for row in rows]
+    assert windows == list(range(10))
+
+
+def test_variable_frame_rate_is_chosen_by_time(tmp_path: Path) -> None:
+    """The first second has 10 frames, the second one 50."""
+    marked_pictures(tmp_path / "p", 60, blurred=set())
+    times = np.concatenate([np.arange(10) / 10, 1 + np.arange(50) / 50])
+    clip = tmp_path / "a.mkv"
+    clock = "settb=1/1000,setpts='if(lt(N,10),N*100,1000+(N-10)*20)'"
+    ffmpeg(
+        "-framerate", "50", "-i", tmp_path / "p" / "%04d.png", "-vf", clock,
+        "-fps_mode", "passthrough", "-enc_time_base", "1:1000", "-pix_fmt", "yuv420p", clip,
+    )  # fmt: skip
+    summary = ingested(tmp_path, clip)
+    assert summary["variable_frame_rate"]
+    _, rows, out = chosen(tmp_path, num_frames=8)
+    length = summary["duration_s"] / 8
+    assert [int(row["timestamp_s"] / length) for row in rows] == list(range(8))
+    for row in rows:
+        number = number_in(out / row["file"])
+        assert number == row["source_frame_index"]
+        assert row["timestamp_s"] == pytest.approx(times[number], abs=0.01)
+
+
+@pytest.mark.parametrize(("degrees", "corner"), [(90, (0, -1)), (180, (-1, -1)), (270, (-1, 0))])
+def test_frames_are_upright(tmp_path: Path, degrees: int, corner: tuple[int, int]) -> None:
+    """A white mark in the stored top left corner lies where a player would show it."""
+    source = "color=black:s=320x180:r=30:d=0.5,drawbox=0:0:60:60:white:fill"
+    clip = rotated(make_clip(tmp_path / "a.mp4", source), tmp_path / "r.mp4", degrees)
+    ingested(tmp_path, clip)
+    summary, rows, out = chosen(tmp_path, long_side_px=160)
+    size = (160, 90) if degrees == 180 else (90, 160)
+    assert (summary["width"], summary["height"]) == size
+    with PIL.Image.open(out / rows[0]["file"]) as image:
+        assert image.size == size
+        pixels = np.asarray(image.convert("L"))
+    marks = {
+        (r, c): int(pixels[5 * r + min(r, 0) * -4, 5 * c + min(c, 0) * -4])
+        for r in (0, -1)
+        for c in (0, -1)
+    }
+    assert max(marks, key=lambda where: marks[where]) == corner
+    assert sorted(marks.values())[2] < 40
+
+
+@pytest.mark.parametrize("kind", ["hlg", "pq"])
+@pytest.mark.parametrize("only_transfer", [False, True])
+def test_hdr_colours_come_back_as_they_were_graded(
+    tmp_path: Path, kind: str, only_transfer: bool
+) -> None:
+    clip = make_hdr_clip(tmp_path / "a.mov", kind, only_transfer=only_transfer)
+    clip = rotated(clip, tmp_path / "r.mov", 90)
+    assert ingested(tmp_path, clip)["hdr"] == kind
+    summary, rows, out = chosen(tmp_path)
+    assert (summary["tone_mapped"], summary["width"], summary["height"]) == (True, 180, 320)
+    with PIL.Image.open(out / rows[0]["file"]) as image:
+        color = np.asarray(image)[160, 90].astype(int)
+    assert np.abs(color - [0x30, 0x60, 0xC0]).max() < 12, color
+
+
+def test_sdr_colours_are_kept(tmp_path: Path) -> None:
+    clip = tmp_path / "a.mp4"
+    ffmpeg(
+        "-f", "lavfi", "-i", "color=c=0x3060c0:s=320x180:r=30:d=0.5,format=gbrp",
+        "-vf", "scale=out_color_matrix=bt709:out_range=limited,format=yuv420p",
+        "-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709",
+        "-color_range", "tv", clip,
+    )  # fmt: skip
+    ingested(tmp_path, clip)
+    _, rows, out = chosen(tmp_path)
+    with PIL.Image.open(out / rows[0]["file"]) as image:
+        color = np.asarray(image)[90, 160].astype(int)
+    assert np.abs(color - [0x30, 0x60, 0xC0]).max() < 5, color
+
+
+def test_odd_sizes_are_written_whole(tmp_path: Path) -> None:
+    clip = make_clip(tmp_path / "a.mp4", "testsrc2=s=322x182:r=30:d=0.5")
+    ingested(tmp_path, clip)
+    summary, rows, out = chosen(tmp_path, long_side_px=161)
+    assert (summary["width"], summary["height"]) == (161, 91)
+    with PIL.Image.open(out / rows[-1]["file"]) as image:
+        assert image.size == (161, 91)
+
+
+def test_sharpness_falls_with_blur() -> None:
+    fine = np.random.default_rng(0).integers(0, 255, (180, 320), np.uint8)
+    soft = np.asarray(
+        PIL.Image.fromarray(fine).resize((80, 45), PIL.Image.Resampling.BOX).resize((320, 180))
+    )
+    gray = np.full((90, 160), 128, np.uint8)
+    scores = [Frame(0, 0.0, luma, (gray, gray)).sharpness() for luma in (fine, soft, gray)]
+    assert scores[0] > 10 * scores[1] > 0
+    assert scores[2] == 0.0
+
+
+def test_progress_rises_and_tells_the_time_left(tmp_path: Path) -> None:
+    ingested(tmp_path, make_clip(tmp_path / "a.mp4"))
+    ctx = context(tmp_path / "job", "frames")
+    seen: list[tuple[float, float | None]] = []
+    ctx.on_progress = lambda fraction, message, eta_s: seen.append((fraction, eta_s))
+    frames.run(FramesOptions(), ctx)
+    assert [fraction for fraction, _ in seen] == sorted(fraction for fraction, _ in seen)
+    assert seen[-1][0] == 1.0
+    assert any(eta_s is not None for _, eta_s in seen)
+
+
+def test_cancel_stops_the_decoding(tmp_path: Path) -> None:
+    ingested(tmp_path, make_clip(tmp_path / "a.mp4"))
+    ctx = context(tmp_path / "job", "frames")
+    ctx.is_cancelled = lambda: (ctx.out / "images" / "frame_00005.jpg").exists()
+    with pytest.raises(Cancelled):
+        frames.run(FramesOptions(), ctx)
+    assert not (ctx.out / "images" / "frame_00010.jpg").exists()
+
+
+@pytest.mark.parametrize(
+    ("container", "options"), [("mp4", ["-movflags", "faststart"]), ("mkv", [])]
+)
+def test_cut_off_video_fails_at_ingest(tmp_path: Path, container: str, options: list[str]) -> None:
+    clip = make_clip(tmp_path / f"a.{container}", "testsrc2=s=320x180:r=30:d=4", *options)
+    clip.write_bytes(clip.read_bytes()[: clip.stat().st_size * 2 // 3])
+    with pytest.raises(CaptureError) as caught:
+        ingested(tmp_path, clip)
+    assert caught.value.code == "video_truncated"
+
+
+def test_video_longer_than_allowed_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="2 s long; 1 s") as caught:
+        ingested(tmp_path, make_clip(tmp_path / "a.mp4"), IngestOptions(max_duration_s=1.0))
+    assert caught.value.code == "video_too_long"
+
+
+def test_video_whose_pictures_are_garbage_is_undecodable(tmp_path: Path) -> None:
+    clip = make_clip(tmp_path / "a.mp4")
+    data = bytearray(clip.read_bytes())
+    start = data.index(b"mdat") + 4
+    end = data.index(b"moov") - 4
+    data[start:end] = np.random.default_rng(0).bytes(end - start)
+    clip.write_bytes(data)
+    with pytest.raises(CaptureError) as caught:
+        ingested(tmp_path, clip)
+    assert caught.value.code == "video_undecodable"
+
+
+def test_video_of_two_frames_is_too_short(tmp_path: Path) -> None:
+    clip = make_clip(tmp_path / "a.mp4", "testsrc2=s=320x180:r=30:d=1", "-frames:v", "2")
+    with pytest.raises(CaptureError) as caught:
+        ingested(tmp_path, clip)
+    assert caught.value.code == "too_few_images"

@@ -1,0 +1,180 @@
+"""The tables, and any order of operations: nothing leaves them, and every job can end."""
+
+from __future__ import annotations
+
+import tempfile
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from storage.db import Database
+from storage.errors import LostLeaseError
+from storage.jobs import request_cancel, stage_id
+from storage.leases import (
+    Claim,
+    cancel_stage,
+    claim_stage,
+    crash_stage,
+    fail_stage,
+    heartbeat,
+    reap_expired,
+    release_stage,
+    release_worker,
+    succeed_stage,
+)
+from storage.models import Event
+from storage.states import (
+    JOB_LIVE,
+    JOB_TERMINAL,
+    JOB_TRANSITIONS,
+    STAGE_TRANSITIONS,
+)
+from tests.factories import DIAMOND, make_database, make_job, states
+
+T0 = datetime(2026, 1, 1, tzinfo=UTC)
+ERROR = {"code": "e", "message": "m", "hint": "h"}
+WORKERS = ("w1", "w2")
+
+
+def test_the_tables_name_only_states_that_they_hold() -> None:
+    for table in (JOB_TRANSITIONS, STAGE_TRANSITIONS):
+        assert set().union(*table.values()) <= set(table)
+    assert {"queued", "running", "cancelling"} == JOB_LIVE
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """Workers, messages and people in any order, with stale claims and leaping clocks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = tempfile.TemporaryDirectory()
+        self.database: Database = make_database(Path(self.folder.name))
+        self.when = T0
+        self.claims: list[Claim] = []
+        with self.database.session_scope() as session:
+            self.job = make_job(session, DIAMOND, when=T0, max_attempts=2).id
+
+    def teardown(self) -> None:
+        """However it went, the job can be brought to its end."""
+        for _ in range(60):
+            if self._states()["job"] in JOB_TERMINAL:
+                break
+            self.when += timedelta(hours=1)
+            with self.database.session_scope() as session:
+                reap_expired(session, when=self.when)
+            self.when += timedelta(hours=1)
+            for stage in DIAMOND:
+                self._claim(stage.name, "w1")
+            for claim in self.claims[-4:]:
+                self._write(claim, "succeed")
+        assert self._states()["job"] in JOB_TERMINAL
+        assert "running" not in self._states().values()
+        self.check_events()
+        self.database.dispose()
+        self.folder.cleanup()
+
+    def _states(self) -> dict[str, str]:
+        with self.database.read_scope() as session:
+            return states(session, self.job)
+
+    def _claim(self, name: str, worker: str) -> None:
+        with self.database.session_scope() as session:
+            claim = claim_stage(session, stage_id(self.job, name), worker, 60.0, when=self.when)
+        if claim is not None:
+            assert all(
+                claim.token > old.token for old in self.claims if old.stage_id == claim.stage_id
+            )
+            self.claims.append(claim)
+
+    def _write(self, claim: Claim, what: str) -> None:
+        holds = {
+            "succeed": lambda s: succeed_stage(
+                s, claim, manifest={}, output_prefix="p/", when=self.when
+            ),
+            "fail": lambda s: fail_stage(s, claim, ERROR, retryable=False, when=self.when),
+            "retry": lambda s: fail_stage(s, claim, ERROR, retryable=True, when=self.when),
+            "crash": lambda s: crash_stage(s, claim, ERROR, when=self.when),
+            "release": lambda s: release_stage(s, claim, when=self.when),
+            "cancel": lambda s: cancel_stage(s, claim, when=self.when),
+        }
+        newest = max(old.token for old in self.claims if old.stage_id == claim.stage_id)
+        try:
+            with self.database.session_scope() as session:
+                holds[what](session)
+        except LostLeaseError:
+            return
+        assert claim.token == newest, "a stale claim wrote"
+
+    @rule(name=st.sampled_from([stage.name for stage in DIAMOND]), worker=st.sampled_from(WORKERS))
+    def deliver(self, name: str, worker: str) -> None:
+        self._claim(name, worker)
+
+    @precondition(lambda self: self.claims)
+    @rule(data=st.data(), what=st.sampled_from(["succeed", "succeed", "retry", "crash", "release"]))
+    def end(self, data: st.DataObject, what: str) -> None:
+        self._write(data.draw(st.sampled_from(self.claims)), what)
+
+    @precondition(lambda self: self.claims)
+    @rule(data=st.data())
+    def fail(self, data: st.DataObject) -> None:
+        self._write(data.draw(st.sampled_from(self.claims)), "fail")
+
+    @precondition(lambda self: self.claims)
+    @rule(data=st.data())
+    def beat(self, data: st.DataObject) -> None:
+        claim = data.draw(st.sampled_from(self.claims))
+        with self.database.session_scope() as session:
+            reply = heartbeat(session, claim, 60.0, progress=0.5, when=self.when)
+        if reply.cancel_requested and not reply.lost:
+            self._write(claim, "cancel")
+
+    @rule(seconds=st.sampled_from([1, 10, 70, 400]))
+    def wait(self, seconds: int) -> None:
+        self.when += timedelta(seconds=seconds)
+        with self.database.session_scope() as session:
+            reap_expired(session, when=self.when)
+
+    @rule(worker=st.sampled_from(WORKERS))
+    def restart(self, worker: str) -> None:
+        with self.database.session_scope() as session:
+            release_worker(session, worker, when=self.when)
+
+    @rule(chance=st.integers(0, 5))
+    def cancel(self, chance: int) -> None:
+        if chance == 0:
+            with self.database.session_scope() as session:
+                request_cancel(session, self.job, when=self.when)
+
+    @invariant()
+    def check_events(self) -> None:
+        """Each change followed the tables, and no stage succeeded twice."""
+        with self.database.read_scope() as session:
+            events = session.query(Event).order_by(Event.seq).all()
+        for event in events:
+            what, _, new = event.kind.partition(".")
+            table = JOB_TRANSITIONS if what == "job" else STAGE_TRANSITIONS
+            if "was" in event.data:
+                assert new in table[event.data["was"]]
+        done = [event.stage for event in events if event.kind == "stage.succeeded"]
+        assert len(done) == len(set(done))
+
+    @invariant()
+    def check_job(self) -> None:
+        """A finished job has nothing that waits; an unfinished one can still move."""
+        found = self._states()
+        stages = [state for name, state in found.items() if name != "job"]
+        if found["job"] in JOB_TERMINAL:
+            assert not {"ready", "blocked"} & set(stages)
+        if found["job"] == "succeeded":
+            assert set(stages) == {"succeeded"}
+        if found["job"] in ("queued", "running"):
+            assert {"ready", "running"} & set(stages)
+        if found["job"] == "cancelling":
+            assert "running" in stages
+
+
+AnyOrder.TestCase.settings = settings(max_examples=25, stateful_step_count=30, deadline=None)
+TestAnyOrder = AnyOrder.TestCase

@@ -1,0 +1,120 @@
+"""When the bell rings again, what is cleaned, and what counts as a GPU."""
+
+from __future__ import annotations
+
+import threading
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from storage.jobs import request_cancel, stage_id
+from storage.leases import cancel_stage, claim_stage
+from storage.objects import LocalObjectStore
+from storage.queries import WaitingStage
+from storage.queue import Bell
+from tests.factories import make_database, make_job
+from worker.housekeeping import Housekeeping, detect_gpu, is_ring_due
+from worker.runtime import WorkerIdentity
+from worker.settings import WorkerSettings
+
+T0 = datetime(2026, 1, 1, tzinfo=UTC)
+NO_BROKER = "redis://127.0.0.1:1/0"
+
+
+def waiting(rung_after_s: float | None) -> WaitingStage:
+    rung = None if rung_after_s is None else T0 + timedelta(seconds=rung_after_s)
+    return WaitingStage("s", False, T0, rung)
+
+
+@pytest.mark.parametrize(
+    ("rung_after_s", "asked_after_s", "due"),
+    [
+        (None, 0, True),
+        (-5, 0, True),  # it rang before the retry's time had come
+        (0, 59, False),
+        (0, 60, True),
+        (60, 119, False),
+        (60, 120, True),
+        (480, 900, False),
+        (480, 960, True),
+    ],
+)
+def test_the_bell_rings_again_after_pauses_that_double(
+    rung_after_s: float | None, asked_after_s: float, due: bool
+) -> None:
+    moment = T0 + timedelta(seconds=asked_after_s)
+    assert is_ring_due(waiting(rung_after_s), moment, 60.0) is due
+
+
+def test_folders_go_when_their_job_is_over_and_nothing_of_it_runs(tmp_path: Path) -> None:
+    database = make_database(tmp_path)
+    work = tmp_path / "work"
+    with database.session_scope() as session:
+        live, over = make_job(session).id, make_job(session).id
+        claim = claim_stage(session, stage_id(over, "first"), "w", 60.0)
+        request_cancel(session, over)
+    for name in (live, over, "of-no-job"):
+        (work / name / "train").mkdir(parents=True)
+    keeper = Housekeeping(
+        database,
+        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
+        Bell(NO_BROKER),
+        WorkerSettings(),
+        work_dir=work,
+        register=lambda: None,
+        offer=lambda: None,
+    )
+    keeper.clean()
+    assert {path.name for path in work.iterdir()} == {live, over}
+    assert claim is not None
+    with database.session_scope() as session:
+        cancel_stage(session, claim)
+    keeper.clean()
+    assert {path.name for path in work.iterdir()} == {live}
+
+
+def test_the_loop_outlives_a_round_that_fails(tmp_path: Path) -> None:
+    rounds: list[float] = []
+    third = threading.Event()
+
+    def register() -> None:
+        rounds.append(time.monotonic())
+        if len(rounds) == 3:
+            third.set()
+        raise RuntimeError("no database today")
+
+    database = make_database(tmp_path)
+    keeper = Housekeeping(
+        database,
+        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
+        Bell(NO_BROKER),
+        WorkerSettings(tick_s=0.01),
+        work_dir=tmp_path / "work",
+        register=register,
+        offer=lambda: None,
+    )
+    keeper.start()
+    assert third.wait(10)
+    keeper.stop(10)
+
+
+def test_a_broker_that_is_away_is_no_error(tmp_path: Path) -> None:
+    database = make_database(tmp_path)
+    with database.session_scope() as session:
+        job = make_job(session).id
+    begun = time.monotonic()
+    assert Bell(NO_BROKER).ring(database, [stage_id(job, "first")]) is False
+    assert time.monotonic() - begun < 10
+
+
+@pytest.mark.parametrize("hidden", ["", "-1"])
+def test_a_hidden_gpu_does_not_count(monkeypatch: pytest.MonkeyPatch, hidden: str) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
+    assert detect_gpu() is False
+
+
+def test_a_worker_without_a_gpu_leaves_the_gpu_queue_alone() -> None:
+    assert WorkerIdentity.of("w", 1, ("cpu", "gpu"), has_gpu=False).queues == ("cpu",)
+    assert WorkerIdentity.of("w", 1, ("cpu", "gpu"), has_gpu=True).queues == ("cpu", "gpu")

@@ -1,0 +1,218 @@
+"""Folders on their way to the object store and back."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.workspace import Workspace
+from storage.errors import ObjectStoreError, ObjectStoreFullError
+from storage.jobs import stage_id
+from storage.leases import Claim, claim_stage
+from storage.models import StageRow
+from storage.objects import LocalObjectStore, OnBytes
+from storage.queries import StageInput, StageWork
+from tests.factories import make_database, make_job
+from worker.checkpoints import CheckpointUploader, Snapshot
+from worker.outcomes import crash_of, failure_of
+from worker.process import scrubbed_environment
+from worker.transfer import download_folder, fetch_inputs, restore_checkpoint, upload_folder
+
+
+def no_guard() -> None:
+    return
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> LocalObjectStore:
+    return LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b"")
+
+
+def stage_folder(root: Path, text: str = "result") -> tuple[Path, dict[str, Any]]:
+    folder = root / "train"
+    (folder / "deep").mkdir(parents=True, exist_ok=True)
+    (folder / "deep" / "file.txt").write_text(text)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    manifest = {
+        "fingerprint": "f",
+        "content": digest,
+        "files": [{"path": "deep/file.txt", "bytes": len(text), "sha256": digest}],
+    }
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder, manifest
+
+
+def work_with(manifest: dict[str, Any]) -> StageWork:
+    inputs = {"train": StageInput("train", "p/", manifest)}
+    return StageWork("k", 0, "f", "video", 0, {}, inputs, None)
+
+
+def test_the_manifest_is_uploaded_last(store: LocalObjectStore, tmp_path: Path) -> None:
+    folder, _ = stage_folder(tmp_path)
+    order: list[str] = []
+
+    class Watching(LocalObjectStore):
+        def put_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
+            order.append(key)
+            super().put_file(key, path, on_bytes)
+
+    watching = Watching(store.root, public_url="", signing_key=b"")
+    upload_folder(watching, folder, "p/", no_guard, workers=4)
+    assert order == ["p/deep/file.txt", "p/manifest.json"]
+
+
+def test_inputs_come_once_and_again_only_where_they_differ(
+    store: LocalObjectStore, tmp_path: Path
+) -> None:
+    folder, manifest = stage_folder(tmp_path)
+    upload_folder(store, folder, "p/", no_guard, workers=2)
+    workspace = Workspace(tmp_path / "job")
+    workspace.root.mkdir()
+    reads, work = ("train", "skipped"), work_with(manifest)
+    fetch_inputs(store, workspace, reads, work, no_guard, workers=2)
+    here = workspace.stage("train") / "deep" / "file.txt"
+    first = here.stat().st_ino
+    fetch_inputs(store, workspace, reads, work, no_guard, workers=2)
+    assert here.stat().st_ino == first
+    stage_folder(workspace.root, "of an attempt that was lost")
+    fetch_inputs(store, workspace, reads, work, no_guard, workers=2)
+    assert here.read_text() == "result"
+
+
+def test_a_damaged_input_is_not_accepted(store: LocalObjectStore, tmp_path: Path) -> None:
+    folder, manifest = stage_folder(tmp_path)
+    upload_folder(store, folder, "p/", no_guard, workers=2)
+    store.path_of("p/deep/file.txt").write_text("rotten")
+    workspace = Workspace(tmp_path / "job")
+    workspace.root.mkdir()
+    with pytest.raises(ObjectStoreError, match="damaged"):
+        fetch_inputs(store, workspace, ("train",), work_with(manifest), no_guard, workers=2)
+    assert not workspace.stage("train").exists()
+
+
+def test_a_guard_ends_a_transfer_and_leaves_nothing(
+    store: LocalObjectStore, tmp_path: Path
+) -> None:
+    class StopError(Exception):
+        pass
+
+    def stop() -> None:
+        raise StopError
+
+    folder, _ = stage_folder(tmp_path)
+    with pytest.raises(StopError):
+        upload_folder(store, folder, "p/", stop, workers=2)
+    assert list(store.list("p/")) == []
+    upload_folder(store, folder, "p/", no_guard, workers=2)
+    with pytest.raises(StopError):
+        download_folder(store, "p/", tmp_path / "new", stop, workers=2)
+    assert not [path for path in tmp_path.iterdir() if "new" in path.name]
+
+
+def claimed(tmp_path: Path) -> tuple[Any, Claim]:
+    database = make_database(tmp_path)
+    with database.session_scope() as session:
+        claim = claim_stage(session, stage_id(make_job(session).id, "first"), "w", 60.0)
+    assert claim is not None
+    return database, claim
+
+
+def snapshot_of(folder: Path, text: str) -> Snapshot:
+    folder.mkdir(parents=True)
+    (folder / "state").write_text(text)
+    found = (folder / "state").stat()
+    return Snapshot(folder, {"state": [found.st_size, found.st_mtime_ns]})
+
+
+def test_only_the_latest_checkpoint_is_kept_and_comes_back(
+    store: LocalObjectStore, tmp_path: Path
+) -> None:
+    database, claim = claimed(tmp_path)
+    for number in (1, 2):
+        uploader = CheckpointUploader(database, store, claim, no_guard, workers=2)
+        uploader._number = number  # as if it were one uploader over time
+        uploader.offer(snapshot_of(tmp_path / f"saved-{number}", f"state {number}"))
+        uploader.close(finish=True, timeout_s=10)
+    with database.read_scope() as session:
+        prefix = session.get_one(StageRow, claim.stage_id).checkpoint_prefix
+    assert list(store.list(f"jobs/{claim.job_id}/")) == [f"{prefix}state"]
+    workspace = Workspace(tmp_path / "job")
+    leftover = workspace.checkpoint("first.saved-old")
+    leftover.mkdir(parents=True)
+    workspace.checkpoint("first").mkdir(parents=True)
+    (workspace.checkpoint("first") / "half").write_text("of an attempt that died")
+    restore_checkpoint(store, workspace, "first", prefix, no_guard, workers=2)
+    assert [path.name for path in workspace.checkpoint("first").iterdir()] == ["state"]
+    assert (workspace.checkpoint("first") / "state").read_text() == "state 2"
+    assert not leftover.exists()
+
+
+def test_a_checkpoint_that_was_written_into_is_not_kept(
+    store: LocalObjectStore, tmp_path: Path
+) -> None:
+    database, claim = claimed(tmp_path)
+    snapshot = snapshot_of(tmp_path / "saved", "state")
+    (snapshot.folder / "state").write_text("state and more")
+    uploader = CheckpointUploader(database, store, claim, no_guard, workers=2)
+    uploader.offer(snapshot)
+    uploader.close(finish=True, timeout_s=10)
+    assert list(store.list(f"jobs/{claim.job_id}/")) == []
+    assert not snapshot.folder.exists()
+
+
+def test_errors_around_a_stage_have_codes_that_people_can_act_on() -> None:
+    with pytest.raises(OSError, match="No space") as full, open("/dev/full", "wb", 0) as file:
+        file.write(b"x")
+    assert full.value.errno == errno.ENOSPC
+    for error, code, retryable in (
+        (full.value, "disk_full", True),
+        (ObjectStoreFullError(""), "disk_full", True),
+        (ObjectStoreError(""), "object_store_unavailable", True),
+        (KeyError("/secret"), "internal_error", True),
+    ):
+        told = failure_of("train", error)
+        assert (told["code"], told["retryable"]) == (code, retryable)
+        assert "/secret" not in json.dumps(told)
+
+
+@pytest.mark.parametrize(
+    ("status", "out_of_memory", "code"),
+    [
+        (-9, True, "out_of_memory"),
+        (-9, False, "worker_lost"),
+        (137, False, "worker_lost"),
+        (-11, False, "stage_crashed"),
+        (1, False, "stage_crashed"),
+    ],
+)
+def test_an_exit_status_says_what_happened(status: int, out_of_memory: bool, code: str) -> None:
+    assert crash_of("train", status, out_of_memory).error["code"] == code
+
+
+def test_a_stage_process_sees_no_keys_of_the_service() -> None:
+    environment = {
+        "PATH": "/bin",
+        "NERFWORKS_HOME": "/h",
+        "NERFWORKS_DATABASE_URL": "postgresql://u:p@h/d",
+        "NERFWORKS_REDIS_URL": "redis://:p@h",
+        "NERFWORKS_S3_SECRET_ACCESS_KEY": "s",
+        "AWS_ACCESS_KEY_ID": "a",
+        "GOOGLE_APPLICATION_CREDENTIALS": "/g",
+        "MY_API_KEY": "k",
+        "OMP_NUM_THREADS": "3",
+    }
+    kept = scrubbed_environment(environment, threads=2)
+    assert set(kept) == {
+        "PATH",
+        "NERFWORKS_HOME",
+        "OMP_NUM_THREADS",
+        "PYTHONPATH",
+        "PYTHONUNBUFFERED",
+    }
+    assert kept["OMP_NUM_THREADS"] == "3"
+    assert scrubbed_environment({}, threads=2)["OMP_NUM_THREADS"] == "2"
