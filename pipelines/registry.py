@@ -52,7 +52,7 @@ STAGES: tuple[Stage, ...] = (
                 "model.zip",
                 "model.zip",
                 "application/zip",
-                "python -m pipelines render, or a later export",
+                "pipelines.nerf.checkpoint.load_model",
             ),
         ),
     ),

@@ -18,8 +18,10 @@ ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("api", "worker", "pipelines", "storage", "deploy")
 HEAVY = ("torch", "numpy", "numba", "open3d", "pycolmap", "skimage")
 
+# llvmlite is the half of numba that kernels write vector code with; it is never there without it.
 NERF_MAY_IMPORT = frozenset(
-    {"torch", "numpy", "numba", "triton", "PIL", "skimage", "safetensors"} | sys.stdlib_module_names
+    {"torch", "numpy", "numba", "llvmlite", "triton", "PIL", "skimage", "safetensors"}
+    | sys.stdlib_module_names
 )
 API_MAY_IMPORT = (
     "api",
