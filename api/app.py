@@ -22,9 +22,9 @@ from api.problems import Problem
 from api.settings import ApiSettings
 from storage.api_keys import ensure_api_key
 from storage.db import Database
-from storage.migrations import upgrade
 from storage.objects import open_object_store
 from storage.queue import Bell
+from storage.schema import upgrade
 
 VERSION = "1"
 logger = logging.getLogger("nerfworks.api")

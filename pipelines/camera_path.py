@@ -150,12 +150,14 @@ def rotation_matrices(q: Floats) -> Floats:
     return stacked
 
 
-def smooth_path(poses: Floats, num_frames: int) -> Floats:
+def smooth_path(poses: Floats, num_frames: int, focus: Floats | None = None) -> Floats:
     """`num_frames` poses along a smooth path through `poses`, at nearly constant speed.
 
     poses: [N, 3, 4] in walking order, N >= 1. Positions are a local linear fit along the arc
     length with a Gaussian window of a thirtieth of the path (wider where poses are sparse), which
     removes the shake of the hand and keeps the way; rotations are the window's mean quaternion.
+    focus: [3], what the cameras look at, where there is such a point: the distance to it is then
+    fitted by itself, so that a gap in the capture is passed around the subject and not through it.
     Returns [num_frames, 3, 4] with exact rotations. Raises ValueError without poses or frames.
     """
     if len(poses) == 0 or num_frames < 1:
@@ -164,13 +166,13 @@ def smooth_path(poses: Floats, num_frames: int) -> Floats:
     s = _arc_length(poses, turn_length)
     if s[-1] <= 1e-9:
         return np.repeat(poses[:1], num_frames, axis=0)
-    dense = _windowed(poses, s, np.linspace(0.0, s[-1], _OVERSAMPLING * num_frames))
+    dense = _windowed(poses, s, np.linspace(0.0, s[-1], _OVERSAMPLING * num_frames), focus)
     s_dense = _arc_length(dense, turn_length)
     # Evenly spaced along the smoothed way: constant speed.
     at = np.interp(
         np.linspace(0.0, s_dense[-1], num_frames), s_dense, np.linspace(0.0, s[-1], len(dense))
     )
-    return _windowed(poses, s, at)
+    return _windowed(poses, s, at, focus)
 
 
 def _arc_length(poses: Floats, turn_length: float) -> Floats:
@@ -182,7 +184,7 @@ def _arc_length(poses: Floats, turn_length: float) -> Floats:
     return length
 
 
-def _windowed(poses: Floats, s: Floats, at: Floats) -> Floats:
+def _windowed(poses: Floats, s: Floats, at: Floats, focus: Floats | None) -> Floats:
     """Poses [M, 3, 4] at arc lengths `at` [M], from `poses` at `s` [N]."""
     offset = s[None, :] - at[:, None]
     # The window reaches the third nearest pose, so that a gap never leaves it empty.
@@ -190,15 +192,34 @@ def _windowed(poses: Floats, s: Floats, at: Floats) -> Floats:
     width = np.maximum(s[-1] * _SMOOTHING_SHARE, third)[:, None]
     weight = np.exp(-0.5 * (offset / width) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    mean_offset = (weight * offset).sum(axis=1)
-    variance = (weight * (offset - mean_offset[:, None]) ** 2).sum(axis=1)
     centers = poses[:, :, 3]
-    mean_center = weight @ centers
-    slope = np.einsum("mn,mn,nd->md", weight, offset - mean_offset[:, None], centers)
-    slope /= np.maximum(variance, 1e-18)[:, None]
-    position = mean_center - slope * mean_offset[:, None]
+    position = _local_line(weight, offset, centers)
+    if focus is not None:
+        wanted = _local_line(weight, offset, np.linalg.norm(centers - focus, axis=1)[:, None])
+        away = position - focus
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        position = focus + away * np.where(length > 1e-9, wanted / np.maximum(length, 1e-9), 1.0)
     q = quaternions(poses[:, :, :3])
     outer = np.einsum("mn,ni,nj->mij", weight, q, q)
     rotation = rotation_matrices(np.linalg.eigh(outer)[1][:, :, -1])
     path: Floats = np.concatenate((rotation, position[:, :, None]), axis=2)
     return path
+
+
+def _local_line(weight: Floats, offset: Floats, values: Floats) -> Floats:
+    """[M, D]: at offset 0, the weighted least-squares line through values [N, D].
+
+    weight: [M, N], rows sum to 1. offset: [M, N].
+    """
+    mean_offset = (weight * offset).sum(axis=1, keepdims=True)
+    centred = offset - mean_offset
+    variance = (weight * centred**2).sum(axis=1, keepdims=True)
+    slope = (weight * centred) @ values / np.maximum(variance, 1e-18)
+    line: Floats = weight @ values - slope * mean_offset
+    return line
+
+
+def nearest_pose_distance(path: Floats, poses: Floats) -> Floats:
+    """[M] how far each pose of a path [M, 3, 4] is from the nearest of `poses` [N, 3, 4]."""
+    distance: Floats = _distances(np.concatenate((path, poses)))[: len(path), len(path) :].min(1)
+    return distance

@@ -55,8 +55,9 @@ class CaptureError(PipelineError):
     """The input cannot be used as it is. The upload is refused, or the job fails, with its code.
 
     Codes in use: empty_file, unknown_type, too_large, archive_unsafe, archive_bomb,
-    archive_encrypted, no_images, video_truncated, no_video_stream, video_too_long,
-    image_undecodable, too_few_images, poses_missing, poses_malformed.
+    archive_damaged, archive_encrypted, no_images, video_truncated, video_undecodable,
+    no_video_stream, video_too_long, image_undecodable, too_few_images, poses_missing,
+    poses_malformed, capture_missing.
     """
 
     code = "capture_unusable"
@@ -80,13 +81,16 @@ class TrainingError(PipelineError):
 
 
 class ExportError(PipelineError):
-    """An asset cannot be made from the trained model. Codes in use: empty_mesh, empty_pointcloud."""
+    """The trained model gives no asset. Codes in use: empty_mesh, empty_pointcloud."""
 
     code = "export_failed"
 
 
 class ToolError(PipelineError):
-    """A program or library that a stage calls failed; `details["log"]` holds its last lines."""
+    """A program or library that a stage calls failed; `details["log"]` holds its last lines.
+
+    Codes in use: tool_failed, tool_missing, tool_timeout.
+    """
 
     code = "tool_failed"
 

@@ -106,9 +106,6 @@ class NerfactoField(nn.Module):
         self.appearance: nn.Embedding | None = None
         if config.appearance_dim:
             self.appearance = nn.Embedding(num_images, config.appearance_dim)
-            # nerfstudio starts with normal numbers; their mean, which renders new views, is then a
-            # code unlike any that was trained. From zero, codes part only as the photos differ.
-            nn.init.zeros_(self.appearance.weight)
 
     def density(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Density [...] per scene unit and geometry features [..., G] at scene points [..., 3]."""

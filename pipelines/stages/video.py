@@ -1,7 +1,7 @@
 """The video stage: a smooth flight through the captured poses, as H.264 for any browser.
 
-Reads `train/model.zip`. Writes `video.mp4` and `preview.jpg`, the middle of the flight at up to
-twice the video's size.
+Reads `train/model.zip`. Writes `video.mp4` and `preview.jpg`: of the middle of the flight the
+moment that is nearest to a captured pose, at up to twice the video's size.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.camera_path import capture_order, smooth_path
+from pipelines.camera_path import capture_order, nearest_pose_distance, smooth_path
 from pipelines.cameras_file import Intrinsics, PosedImage
 from pipelines.depth_views import Pinhole
 from pipelines.options import VideoOptions
+from pipelines.scene_bounds import camera_focus
 from pipelines.stage import StageContext
 from pipelines.trained_scene import TrainedScene
 from pipelines.video_writer import VideoWriter
@@ -48,7 +49,7 @@ def run(options: VideoOptions, ctx: StageContext) -> dict[str, Any]:
         _PREVIEW_ENLARGEMENT * options.long_side_px,
         max(lens.width, lens.height, options.long_side_px),
     )
-    picture = scene.picture(Pinhole.of(lens, long_side), path[len(path) // 2])
+    picture = scene.picture(Pinhole.of(lens, long_side), path[preview_index(path, images)])
     Image.fromarray(picture).save(ctx.out / "preview.jpg", quality=_PREVIEW_QUALITY)
     return {
         "num_frames": len(path),
@@ -66,7 +67,14 @@ def camera_path(images: Sequence[PosedImage], num_frames: int) -> NDArray[np.flo
     order = capture_order(
         poses, [image.file for image in images], [image.timestamp_s for image in images]
     )
-    return smooth_path(poses[order], num_frames)
+    return smooth_path(poses[order], num_frames, camera_focus(poses))
+
+
+def preview_index(path: NDArray[np.float64], images: Sequence[PosedImage]) -> int:
+    """The pose in the middle third of the path that is nearest to a captured one."""
+    first, last = len(path) // 3, len(path) - len(path) // 3
+    poses = np.asarray([image.world_from_camera for image in images], np.float64)
+    return first + int(np.argmin(nearest_pose_distance(path[first:last], poses)))
 
 
 def typical_lens(lenses: Sequence[Intrinsics]) -> Intrinsics:

@@ -1,3 +1,0 @@
-from storage.schema import upgrade
-
-__all__ = ["upgrade"]

@@ -9,6 +9,7 @@ from pipelines.camera_path import (
     Floats,
     capture_order,
     natural_key,
+    nearest_pose_distance,
     quaternions,
     rotation_matrices,
     smooth_path,
@@ -89,6 +90,15 @@ def test_a_gap_in_the_poses_is_bridged_without_a_jump() -> None:
     steps = np.linalg.norm(np.diff(path[:, :, 3], axis=0), axis=1)
     assert np.all(np.isfinite(path))
     assert steps.max() < 2.0 * np.median(steps)
+
+
+def test_a_gap_is_passed_around_the_subject_and_not_through_it() -> None:
+    poses = arc(60)
+    path = smooth_path(np.concatenate((poses[:8], poses[-8:])), 96, focus=np.zeros(3))
+    distance = np.linalg.norm(path[:, :, 3], axis=1)
+    wanted = np.linalg.norm(poses[0, :, 3])
+    np.testing.assert_allclose(distance, wanted, rtol=0.02)
+    assert nearest_pose_distance(path, poses).max() < 0.35
 
 
 @pytest.mark.parametrize("num", [1, 2, 3])
