@@ -61,16 +61,21 @@ class Bell:
         ids = list(stage_ids)
         if not ids:
             return True
-        with database.session_scope() as session:
+        with database.read_scope() as session:
             rows = session.execute(
                 select(StageRow.id, StageRow.needs_gpu).where(StageRow.id.in_(ids))
             ).all()
-            session.execute(
-                update(StageRow).where(StageRow.id.in_(ids)).values(rung_at=now(session))
-            )
             gpu = has_live_gpu(session)
-        sent = [self._send(TASK_RUN_STAGE, [row.id], queue_for(row.needs_gpu, gpu)) for row in rows]
-        return all(sent)
+        sent = [
+            row.id
+            for row in rows
+            if self._send(TASK_RUN_STAGE, [row.id], queue_for(row.needs_gpu, gpu))
+        ]
+        if sent:
+            with database.session_scope() as session:
+                rung = update(StageRow).where(StageRow.id.in_(sent), StageRow.state == "ready")
+                session.execute(rung.values(rung_at=now(session)))
+        return len(sent) == len(rows)
 
     def ring_sweep(self) -> bool:
         """Ask any worker for a round of housekeeping now. Whether the message went."""

@@ -15,12 +15,13 @@ import sys
 import threading
 from typing import Any
 
-from celery.signals import worker_shutting_down
+from celery.signals import worker_ready, worker_shutting_down
 
 from storage.queue import QUEUES
 from storage.schema import upgrade
 from storage.settings import StorageSettings
 from worker.app import make_app
+from worker.consumer import ConsumerLink
 from worker.housekeeping import detect_gpu
 from worker.runtime import WorkerIdentity, WorkerRuntime, set_current_runtime
 from worker.settings import WorkerSettings
@@ -72,11 +73,13 @@ def main(arguments: list[str] | None = None) -> None:
     )
     storage = StorageSettings()
     upgrade(storage.resolved_database_url)  # whoever starts first makes the schema
+    link = ConsumerLink()
     runtime = WorkerRuntime(
         WorkerIdentity.of(chosen.id, chosen.slots, chosen.queues, detect_gpu()),
         storage,
         WorkerSettings(),
         registry=os.environ.get("NERFWORKS_REGISTRY", "pipelines.registry"),
+        on_unheard=link.reconnect,
     )
     set_current_runtime(runtime)
 
@@ -84,7 +87,11 @@ def main(arguments: list[str] | None = None) -> None:
         runtime.shutdown.set()
         _exit_in_time()
 
+    def on_ready(sender: Any, **_: Any) -> None:
+        link.attach(sender)
+
     worker_shutting_down.connect(on_shutdown, weak=False)
+    worker_ready.connect(on_ready, weak=False)
     runtime.start()
     try:
         make_app(storage).worker_main(

@@ -11,7 +11,7 @@ import os
 import queue
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -56,8 +56,11 @@ class WorkerRuntime:
         settings: WorkerSettings,
         *,
         registry: str,
+        on_unheard: Callable[[], None] = lambda: None,
     ) -> None:
+        """on_unheard: called when the bell rang for a stage and no idle slot, ours included, came."""
         self.identity = identity
+        self._on_unheard = on_unheard
         self.shutdown = threading.Event()
         self._settings = settings
         self._database = Database(storage.resolved_database_url)
@@ -174,9 +177,13 @@ class WorkerRuntime:
         if self._free.empty() or self.shutdown.is_set():
             return
         waiting = self._waiting(self._settings.direct_after_s)
-        if waiting:
-            _log.info("taking %s, which nobody came for", waiting[0].id)
-            self._direct.submit(self.serve, waiting[0].id)
+        if not waiting:
+            return
+        _log.info("taking %s, which nobody came for", waiting[0].id)
+        self._direct.submit(self.serve, waiting[0].id)
+        rung_at, since = waiting[0].rung_at, waiting[0].since
+        if rung_at is not None and rung_at >= since:
+            self._on_unheard()
 
 
 _current: list[WorkerRuntime] = []

@@ -40,9 +40,8 @@ def images(cameras: Cameras) -> ImageData:
 @pytest.fixture(scope="module")
 def trained(images: ImageData, cameras: Cameras) -> Nerfacto:
     config = tiny_config(max_steps=200, rays_per_step=512, engine="fast")
-    # All views have one exposure and true poses: codes and corrections could only fit noise.
-    model = replace(config.model, camera_mode="off", appearance_dim=0)
-    config = replace(config, model=model)
+    # The poses are true: corrections could only fit noise.
+    config = replace(config, model=replace(config.model, camera_mode="off"))
     indices = [index for index in range(len(cameras)) if index != HELD_OUT]
     return train(images, cameras, indices, config, seed=0)
 
@@ -53,13 +52,13 @@ def _held_out_psnr(model: Nerfacto, images: ImageData, cameras: Cameras) -> floa
     return psnr(rgb, images.image(HELD_OUT))
 
 
-def test_a_held_out_view_of_a_ball_reaches_twenty_db(
+def test_a_held_out_view_of_a_ball_reaches_nineteen_db(
     trained: Nerfacto, images: ImageData, cameras: Cameras
 ) -> None:
     torch.manual_seed(0)
     untrained = Nerfacto(trained.config, trained.num_train_images).eval()
     assert _held_out_psnr(untrained, images, cameras) < 14.0
-    assert _held_out_psnr(trained, images, cameras) > 20.0
+    assert _held_out_psnr(trained, images, cameras) > 19.0
 
 
 def test_the_depth_of_the_ball_is_found(trained: Nerfacto, cameras: Cameras) -> None:
@@ -69,7 +68,7 @@ def test_the_depth_of_the_ball_is_found(trained: Nerfacto, cameras: Cameras) -> 
         depth = trained(rays)["depth"]
     hit = truth.isfinite()
     error = (depth - truth)[hit].abs()
-    assert float(error.median()) < 0.3 * RADIUS
+    assert float(error.median()) < 0.2 * RADIUS
 
 
 def _same_parameters(one: Nerfacto, other: Nerfacto) -> bool:

@@ -82,6 +82,8 @@ def tiny_config(**changes: object) -> TrainConfig:
         hidden_dim=32,
         hidden_dim_color=32,
         appearance_dim=4,
+        # What lies right before one camera no other sees: a place for errors to hide in.
+        near=0.3,
         # Few steps are not enough to bring matter in from the far end, where 0.01 leaves it.
         average_init_density=1.0,
         anneal_steps=40,
