@@ -23,6 +23,16 @@ Floats = NDArray[np.float64]
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT32, _UINT16 = 5126, 5125, 5123
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_MATERIAL: dict[str, Any] = {
+    "name": "captured",
+    "doubleSided": True,
+    "pbrMetallicRoughness": {
+        "baseColorFactor": [1.0, 1.0, 1.0, 1.0],
+        "metallicFactor": 0.0,
+        "roughnessFactor": 1.0,
+    },
+    "extensions": {"KHR_materials_unlit": {}},
+}
 
 
 def linear_from_srgb(color: Floats) -> Floats:
@@ -110,18 +120,7 @@ def _document(
                 ]
             }
         ],
-        "materials": [
-            {
-                "name": "captured",
-                "doubleSided": True,
-                "pbrMetallicRoughness": {
-                    "baseColorFactor": [1.0, 1.0, 1.0, 1.0],
-                    "metallicFactor": 0.0,
-                    "roughnessFactor": 1.0,
-                },
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
+        "materials": [_MATERIAL],
         "accessors": [
             {
                 "bufferView": 0,

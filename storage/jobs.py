@@ -38,6 +38,27 @@ def stage_id(job_id: str, name: str) -> str:
     return f"{job_id}-{name}"
 
 
+def _stage_rows(job_id: str, stages: Sequence[StageSeed], max_attempts: int) -> list[StageRow]:
+    return [
+        StageRow(
+            id=stage_id(job_id, stage.name),
+            job_id=job_id,
+            name=stage.name,
+            seq=position,
+            after=list(stage.after),
+            state="skipped" if stage.skipped else "blocked",
+            needs_gpu=stage.needs_gpu,
+            max_attempts=max_attempts,
+            lease_token=0,
+            attempt=0,
+            crashes=0,
+            progress=0.0,
+            message="",
+        )
+        for position, stage in enumerate(stages)
+    ]
+
+
 def create_job(
     session: Session,
     *,
@@ -77,24 +98,7 @@ def create_job(
     )
     session.add(job)
     session.flush()
-    rows = [
-        StageRow(
-            id=stage_id(job.id, stage.name),
-            job_id=job.id,
-            name=stage.name,
-            seq=position,
-            after=list(stage.after),
-            state="skipped" if stage.skipped else "blocked",
-            needs_gpu=stage.needs_gpu,
-            max_attempts=max_attempts,
-            lease_token=0,
-            attempt=0,
-            crashes=0,
-            progress=0.0,
-            message="",
-        )
-        for position, stage in enumerate(stages)
-    ]
+    rows = _stage_rows(job.id, stages, max_attempts)
     session.add_all(rows)
     record_event(session, job.id, "job.queued", when)
     session.flush()

@@ -1,6 +1,6 @@
 """Wakes a Celery consumer that has gone deaf.
 
-Where Redis dies at the moment in which a pool thread acknowledges a message, Celery 5.7 logs
+Where Redis is away at the moment in which a pool thread acknowledges a message, Celery 5.7 logs
 "Couldn't ack", drops the consumer's connection in that thread, and its main loop never learns of
 it: the process lives and consumes nothing (the family of celery#10205). A worker that finds a stage
 for which the bell rang and no idle slot came therefore asks for a reconnect: an error raised inside
@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 _log = logging.getLogger("nerfworks.worker")
-PAUSE_S = 30.0
+PAUSE_S = 5.0
 
 
 class ConsumerLink:

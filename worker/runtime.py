@@ -58,7 +58,7 @@ class WorkerRuntime:
         registry: str,
         on_unheard: Callable[[], None] = lambda: None,
     ) -> None:
-        """on_unheard: called when the bell rang for a stage and no idle slot, ours included, came."""
+        """on_unheard: called when the bell rang for a stage and no idle slot came,."""
         self.identity = identity
         self._on_unheard = on_unheard
         self.shutdown = threading.Event()

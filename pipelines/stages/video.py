@@ -1,7 +1,7 @@
 """The video stage: a smooth flight through the captured poses, as H.264 for any browser.
 
-Reads `train/model.zip`. Writes `video.mp4` and `preview.jpg`: of the middle of the flight the
-moment that is nearest to a captured pose, at up to twice the video's size.
+Reads `train/model.zip`. Writes `video.mp4` and `preview.jpg`, a telling moment of the flight at up
+to twice the video's size.
 """
 
 from __future__ import annotations
@@ -71,10 +71,21 @@ def camera_path(images: Sequence[PosedImage], num_frames: int) -> NDArray[np.flo
 
 
 def preview_index(path: NDArray[np.float64], images: Sequence[PosedImage]) -> int:
-    """The pose in the middle third of the path that is nearest to a captured one."""
-    first, last = len(path) // 3, len(path) - len(path) // 3
+    """A telling moment of the path for the picture that stands for the job.
+
+    Of the middle two thirds, the half that is nearest to captured poses; of these the one that
+    has what the cameras look at most in its middle, or where there is no such point, the nearest.
+    """
+    first, last = len(path) // 6, len(path) - len(path) // 6
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
-    return first + int(np.argmin(nearest_pose_distance(path[first:last], poses)))
+    candidates = path[first:last]
+    distance = nearest_pose_distance(candidates, poses)
+    focus = camera_focus(poses)
+    if focus is None:
+        return first + int(np.argmin(distance))
+    to_focus = focus - candidates[:, :, 3]
+    centred = -(candidates[:, :, 2] * to_focus).sum(axis=1) / np.linalg.norm(to_focus, axis=1)
+    return first + int(np.argmax(np.where(distance <= np.median(distance), centred, -np.inf)))
 
 
 def typical_lens(lenses: Sequence[Intrinsics]) -> Intrinsics:

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.cameras_file import Intrinsics
+from pipelines.cameras_file import Intrinsics, PosedImage
 from pipelines.errors import Cancelled
 from pipelines.manifest import RunHooks
-from pipelines.stages.video import camera_path, typical_lens
+from pipelines.stages.video import camera_path, preview_index, typical_lens
 from pipelines.tools.ffmpeg import probe
 from pipelines.trained_scene import TrainedScene
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
+from tests.unit.pipelines.synthetic_views import look_at, ring
 
 
 def test_the_video_plays_in_a_browser(job: Workspace) -> None:
@@ -39,6 +40,19 @@ def test_the_path_follows_the_walk(trained_job: Workspace) -> None:
     extent = np.linalg.norm(last - first)
     assert np.linalg.norm(path[0][:, 3] - first) < 0.1 * extent
     assert np.linalg.norm(path[-1][:, 3] - last) < 0.1 * extent
+
+
+def test_the_preview_looks_at_the_subject_from_where_someone_stood() -> None:
+    poses = ring(30, np.zeros(3))[::3]
+    images = [
+        PosedImage(f"{index}.jpg", 0, tuple(tuple(map(float, row)) for row in pose))
+        for index, pose in enumerate(poses)
+    ]
+    path = np.repeat(poses, 2, axis=0)
+    aside = look_at(path[9, :, 3], np.array([1.5, 0.0, 0.0]))
+    path[:] = aside
+    path[9] = poses[4]
+    assert preview_index(path, images) == 9
 
 
 def test_a_cancel_in_the_middle_leaves_nothing(job: Workspace) -> None:

@@ -33,6 +33,7 @@ OPTIONS: dict[str, Any] = {
             "hidden_dim": 32,
             "hidden_dim_color": 32,
             "appearance_dim": 4,
+            "camera_mode": "so3xr3",
             "anneal_steps": 50,
         },
         "data": {"long_side_px": LONG_SIDE},
