@@ -175,9 +175,7 @@ def _field_of(annotation: Any, field: dataclasses.Field[Any]) -> tuple[Any, Any]
     if field.default_factory is not dataclasses.MISSING:
         made = field.default_factory()
         default: Any = _plain(made)
-        return annotation, Field(
-            default_factory=lambda: default, description=description, **bounds
-        )
+        return annotation, Field(default_factory=lambda: default, description=description, **bounds)
     return annotation, Field(default=field.default, description=description, **bounds)
 
 
@@ -289,7 +287,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                         "optimizer": {"decay_steps": 1500, "lr_final": 1e-3},
                     },
                     "pointcloud": {"num_points": 200_000},
-                    "mesh": {"resolution": 160, "num_views": 48, "render_long_side_px": 240},
+                    "mesh": {"num_views": 48, "render_long_side_px": 240},
                     "video": {"num_frames": 96, "long_side_px": 480},
                 },
             ),

@@ -131,9 +131,7 @@ STAGES: tuple[Stage, ...] = (
         run="pipelines.stages.report:run",
         options="ReportOptions",
         time_limit_s=600.0,
-        artifacts=(
-            Artifact("report.json", "report.json", "application/json", "any text editor"),
-        ),
+        artifacts=(Artifact("report.json", "report.json", "application/json", "any text editor"),),
     ),
 )
 

@@ -1,18 +1,18 @@
 """Every path inside a job's folder.
 
-    JOB/
-      input/capture             the uploaded bytes, as they came
-      job.json                  filename, kind, seed: what the stages may know of the job
-      ingest/                   capture.json, images/ (photos and app exports), cameras.json (posed)
-      frames/                   frames.json, images/ (only for videos)
-      poses/                    cameras.json, report.json, points.ply (only where no poses came)
-      train/                    model.zip, cameras.json, previews/
-      evaluate/                 metrics.json, images/
-      pointcloud/ mesh/ video/  the assets
-      report/                   report.json
-      <stage>/manifest.json     written last: a folder with a manifest is complete
-      .partial/<stage>/         what a running stage writes
-      .checkpoint/<stage>/      what outlives a failed attempt
+JOB/
+  input/capture             the uploaded bytes, as they came
+  job.json                  filename, kind, seed: what the stages may know of the job
+  ingest/                   capture.json, images/ (photos and app exports), cameras.json (posed)
+  frames/                   frames.json, images/ (only for videos)
+  poses/                    cameras.json, report.json, points.ply (only where no poses came)
+  train/                    model.zip, cameras.json, previews/
+  evaluate/                 metrics.json, images/
+  pointcloud/ mesh/ video/  the assets
+  report/                   report.json
+  <stage>/manifest.json     written last: a folder with a manifest is complete
+  .partial/<stage>/         what a running stage writes
+  .checkpoint/<stage>/      what outlives a failed attempt
 """
 
 from __future__ import annotations

@@ -39,6 +39,8 @@ def scrubbed_environment(environment: Mapping[str, str], threads: int) -> dict[s
     kept["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
     kept["PYTHONUNBUFFERED"] = "1"
     kept.setdefault("OMP_NUM_THREADS", str(threads))
+    # OpenMP's waiting threads must not spin: see pipelines/__main__.py for what that costs.
+    kept.setdefault("OMP_WAIT_POLICY", "passive")
     return kept
 
 
