@@ -11,12 +11,22 @@ from api.client import Client
 from deploy.embedded import Embedded
 from deploy.supervisor import Supervisor
 from pipelines.cameras_file import CamerasFile
+from pipelines.options import merge
 from pipelines.ply import read_ply
 from pipelines.registry import STAGE_NAMES, STAGES
 from pipelines.sample.judge import judge_mesh, judge_poses
+from tests.capture_writers import write_hdr_hevc
 from tests.samples import SMALL
 
 pytestmark = [pytest.mark.services, pytest.mark.slow]
+
+BRIEF = {
+    "frames": {"num_frames": 32},
+    "train": {"max_steps": 150, "optimizer": {"decay_steps": 150}},
+    "pointcloud": {"num_points": 5000},
+    "mesh": {"resolution": 64, "num_views": 12, "render_long_side_px": 96},
+    "video": {"num_frames": 8, "long_side_px": 96},
+}
 
 REPORT_KEYS = (
     ("capture", "kind"),
@@ -67,3 +77,29 @@ def test_video_over_http_comes_back_as_assets_true_to_the_scene(
     judged = judge_mesh(mesh.points, mesh.faces, poses.alignment, truth)
     assert judged.accuracy < 0.03, judged
     assert judged.completeness < 0.03, judged
+
+
+def test_hdr_rotated_hevc_clip_goes_through(
+    service: tuple[Client, Embedded, Supervisor], tmp_path: Path
+) -> None:
+    client, _, _ = service
+    clip = tmp_path / "IMG_0001.MOV"
+    truth = write_hdr_hevc(clip, num=60, long_side_px=640)
+    capture = client.upload(clip)
+    assert capture.kind == "video"
+    job = client.create_job(capture.id, preset="preview", options=merge(SMALL, BRIEF))
+    job = client.wait(job.id, timeout=400)
+    assert job.state == "succeeded", job.error
+
+    out = tmp_path / "out"
+    client.download(job.id, out)
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    assert report["poses"]["registered_ratio"] >= 0.9
+    assert report["metrics"]["width"] < report["metrics"]["height"], "not upright"
+    cameras = CamerasFile.load(out / "cameras.json")
+    assert judge_poses(cameras, truth).mean_center_error < 0.01
+    # Trained on wrong colours (a flat HDR picture, say) the scene's bright paints would be grey.
+    points = read_ply(out / "pointcloud.ply")
+    assert points.colors is not None
+    spread = points.colors.max(axis=1).astype(int) - points.colors.min(axis=1)
+    assert (spread > 80).mean() > 0.1

@@ -1,8 +1,8 @@
 """Numba twin of `encodings.hash_encode`: forward, and backward to the table and to the points.
 
 Symbols as in `encodings`: L levels, F features, P points. Sums are taken in another order than in
-the plain definition, so values agree to float32 rounding. Backward gives one level to one thread,
-so that no two threads write the same entry and the result depends only on the number of threads.
+the plain definition, so values agree to float32 rounding. Backward gives a level to one thread, so
+that no two threads write the same entry and results repeat.
 """
 
 # Kernels carry no annotations: numba infers their types, docstrings state shapes.
@@ -121,9 +121,9 @@ def encode_points(points, count, table, resolutions, dense, offsets, out):
 
 
 @compiled
-def _forward(thread, threads, points, table, resolutions, dense, offsets, out):
+def _forward(share, shares, points, table, resolutions, dense, offsets, out):
     num_points = len(points)
-    for tile in range(thread, (num_points + TILE - 1) // TILE, threads):
+    for tile in range(share, (num_points + TILE - 1) // TILE, shares):
         begin = tile * TILE
         count = min(TILE, num_points - begin)
         encode_points(points[begin:], count, table, resolutions, dense, offsets, out[begin:])
@@ -196,12 +196,12 @@ def differentiate_level(
 
 @compiled
 def _backward_table(
-    thread, threads, points, table, resolutions, dense, offsets, grad_out, grad_table
+    share, shares, points, table, resolutions, dense, offsets, grad_out, grad_table
 ):
     num_features = table.shape[1]
     num_levels = len(resolutions)
     # Levels are dealt in turn, because fine levels cost more than coarse ones.
-    for level in range(thread, num_levels, threads):
+    for level in range(share, num_levels, shares):
         scatter_level(
             points,
             table,
@@ -217,11 +217,11 @@ def _backward_table(
 
 @compiled
 def _backward_points(
-    thread, threads, points, table, resolutions, dense, offsets, grad_out, grad_points
+    share, shares, points, table, resolutions, dense, offsets, grad_out, grad_points
 ):
     num_features = table.shape[1]
     num_points = len(points)
-    for tile in range(thread, (num_points + TILE - 1) // TILE, threads):
+    for tile in range(share, (num_points + TILE - 1) // TILE, shares):
         begin, end = tile * TILE, min((tile + 1) * TILE, num_points)
         for level in range(len(resolutions)):
             differentiate_level(

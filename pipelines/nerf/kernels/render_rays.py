@@ -296,11 +296,11 @@ def _render_block(model, scratch, origins, directions, rgb, accumulation, median
 
 
 @compiled
-def _render(thread, threads, model, origins, directions, rgb, accumulation, median, expected):
-    """This thread's share: every n-th block, since neighbouring blocks cost about the same."""
+def _render(share, shares, model, origins, directions, rgb, accumulation, median, expected):
+    """One share: every n-th block, since neighbouring blocks cost about the same."""
     num_rays = len(origins)
     scratch = _make_scratch(model)
-    for begin in range(thread * BLOCK_RAYS, num_rays, threads * BLOCK_RAYS):
+    for begin in range(share * BLOCK_RAYS, num_rays, shares * BLOCK_RAYS):
         end = min(begin + BLOCK_RAYS, num_rays)
         _render_block(
             model,

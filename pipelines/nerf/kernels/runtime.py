@@ -1,7 +1,7 @@
 """How the numba kernels are compiled, cached and spread over threads.
 
 Threads: kernels are single-threaded functions that release the interpreter's lock and take
-`(thread, threads, ...)`; `run_threads` calls one on several Python threads, each doing its share.
+`(share, shares, ...)`; `run_threads` hands the shares to several Python threads.
 This needs no threading layer of numba's (no libgomp, no tbb), compiles in a third of the time, and
 several callers may run at once.
 
@@ -23,6 +23,8 @@ from typing import Any
 
 import numba
 import torch
+
+SHARES_PER_THREAD = 8
 
 # Everything but the promise that there are no NaN: a diverged training must show, not hide.
 FAST_MATH = {"contract", "reassoc", "nsz", "arcp", "afn"}
@@ -78,16 +80,25 @@ def num_threads() -> int:
 
 
 def run_threads(kernel: Callable[..., None], *arguments: Any) -> None:
-    """Call `kernel(thread, threads, *arguments)` for each thread at once; return when all are done.
+    """Call `kernel(share, shares, *arguments)` for every share; return when all are done.
 
-    Which share a thread does depends only on the number of threads, so results repeat.
+    There are several shares to a thread, and a thread takes the next one when it is done with one,
+    so that a core that is also wanted elsewhere does less instead of keeping the others waiting. A
+    share writes what no other share writes, so results repeat whoever does it.
     """
     threads = num_threads()
+    shares = threads * SHARES_PER_THREAD
     if threads == 1:
         kernel(0, 1, *arguments)
         return
+    waiting = iter(range(shares))  # `next` is atomic under the interpreter's lock
+
+    def work() -> None:
+        for share in waiting:
+            kernel(share, shares, *arguments)
+
     with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(kernel, i, threads, *arguments) for i in range(1, threads)]
-        kernel(0, threads, *arguments)
+        others = [pool.submit(work) for _ in range(threads - 1)]
+        work()
     for other in others:
         other.result()
