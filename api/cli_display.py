@@ -253,7 +253,11 @@ def print_results(
 ) -> None:
     """The tables of a finished job: each artifact in `folder`, then the quality."""
     console = console or Console()
-    artifacts = Table("artifact", "path", "size", "opens with", title=f"Job {job.id}", box=None)
+    artifacts = Table(title=f"Job {job.id}", box=None)
+    artifacts.add_column("artifact", no_wrap=True)
+    artifacts.add_column("path", overflow="fold")
+    artifacts.add_column("size", no_wrap=True, justify="right")
+    artifacts.add_column("opens with", overflow="fold")
     found: list[Artifact] = [one for one in job.artifacts if (folder / one.name).is_file()]
     for artifact in found:
         artifacts.add_row(

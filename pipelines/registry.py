@@ -52,7 +52,7 @@ STAGES: tuple[Stage, ...] = (
                 "model.zip",
                 "model.zip",
                 "application/zip",
-                "pipelines.nerf.checkpoint.load_model",
+                "Python: load_model",
             ),
         ),
     ),

@@ -211,6 +211,7 @@ def test_a_stage_process_sees_no_keys_of_the_service() -> None:
         "PATH",
         "NERFWORKS_HOME",
         "OMP_NUM_THREADS",
+        "OMP_WAIT_POLICY",
         "PYTHONPATH",
         "PYTHONUNBUFFERED",
     }
