@@ -56,6 +56,6 @@ def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
         supervisor.stop()
     report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
     assert report["capture"]["kind"] == "polycam"
-    assert report["metrics"]["psnr"] >= 20.0
+    assert report["metrics"]["psnr"] >= 17.0
     left = [path for path in s3_endpoint.folder.rglob("*") if path.is_file()]
     assert not left, f"bytes are left after the deletes: {left}"

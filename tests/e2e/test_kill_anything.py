@@ -7,6 +7,7 @@ training must go on from its checkpoint.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from collections import Counter
@@ -113,4 +114,6 @@ def test_job_succeeds_though_every_process_is_killed(
     runs = finished_runs(embedded, job.id)
     assert set(runs.values()) == {1}, runs
     log = "\n".join(client.logs(job.id, stage="train"))
-    assert "resum" in log.lower(), log[-2000:]
+    steps = [int(step) for step in re.findall(r"going on from step (\d+)", log)]
+    assert len(steps) == 2, log[-2000:]
+    assert 0 < steps[0] < steps[1], "training did not resume from its checkpoints"
