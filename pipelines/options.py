@@ -14,7 +14,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from pipelines.nerf.config import TrainConfig
+from pipelines.nerf.config import (
+    NERFACTO,
+    TrainConfig,
+    allowed_names,
+    config_from_dict,
+    default_train_config,
+    find_method,
+    methods,
+    validate,
+)
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.evaluation_config import EvaluateConfig
 from pipelines.registry import STAGE_NAMES
 
 
@@ -95,14 +106,6 @@ class PosesOptions(StageOptions):
     num_threads: int = Field(-1, ge=-1, le=1024, description="Threads; -1 for all.")
 
 
-class EvaluateOptions(StageOptions):
-    """Held-out metrics."""
-
-    max_images: int = Field(
-        0, ge=0, le=100_000, description="Held-out images measured, evenly picked; 0 for all."
-    )
-
-
 class CropOptions(StageOptions):
     """What part of the scene is exported, common to mesh and point cloud."""
 
@@ -162,7 +165,7 @@ def _field_of(annotation: Any, field: dataclasses.Field[Any]) -> tuple[Any, Any]
         description = f"{description} Unit: {meta['unit']}."
     bounds = {key: meta[key] for key in ("ge", "le") if key in meta}
     if "choices" in meta:
-        annotation = Literal[tuple(meta["choices"])]
+        annotation = Literal[allowed_names(meta)]
         bounds = {}
     elif typing.get_origin(annotation) is tuple:
         (item, *_) = typing.get_args(annotation)
@@ -188,51 +191,59 @@ def _plain(value: Any) -> Any:
     return value
 
 
-_MODELS: dict[type, type[StageOptions]] = {}
+_MODELS: dict[tuple[type, type | None], type[StageOptions]] = {}
 
 
-def _model_of(cls: Any) -> type[StageOptions]:
-    """The pydantic model with the fields, defaults and bounds of a dataclass."""
-    if cls not in _MODELS:
+def _model_of(cls: Any, model: Any = None) -> type[StageOptions]:
+    """The pydantic model with the fields, defaults and bounds of a dataclass.
+
+    model: for `TrainConfig`, the class of the method's own options.
+    """
+    if (cls, model) not in _MODELS:
         hints = typing.get_type_hints(cls)
         fields: dict[str, Any] = {
             field.name: _field_of(hints[field.name], field) for field in dataclasses.fields(cls)
         }
-        _MODELS[cls] = create_model(
+        if model is not None:
+            fields["method"] = (Literal[tuple(methods())], fields["method"][1])
+            made = _plain(model())
+            fields["model"] = (
+                _model_of(model),
+                Field(default_factory=lambda: made, description="The model's options."),
+            )
+        _MODELS[cls, model] = create_model(
             cls.__name__.replace("Config", "Options"),
             __base__=StageOptions,
             __doc__=cls.__doc__,
             **fields,
         )
-    return _MODELS[cls]
+    return _MODELS[cls, model]
 
 
-TrainOptions: type[StageOptions] = _model_of(TrainConfig)
-"""`TrainConfig`, checked."""
+def train_options(method: str) -> type[StageOptions]:
+    """`TrainConfig` with the options of a method, checked. Raises OptionsError for no method."""
+    try:
+        return _model_of(TrainConfig, find_method(method).config)
+    except NerfError as error:
+        raise OptionsError([("train.method", error.message)]) from error
 
 
-def build_dataclass(cls: Any, values: dict[str, Any]) -> Any:
-    """The inverse of `_model_of`: plain validated values back into (nested, frozen) dataclasses."""
-    hints = typing.get_type_hints(cls)
-    made: dict[str, Any] = {}
-    for name, value in values.items():
-        annotation = hints[name]
-        if dataclasses.is_dataclass(annotation):
-            made[name] = build_dataclass(annotation, value)
-        elif typing.get_origin(annotation) is tuple:
-            item = typing.get_args(annotation)[0]
-            made[name] = tuple(
-                build_dataclass(item, part) if dataclasses.is_dataclass(item) else part
-                for part in value
-            )
-        else:
-            made[name] = value
-    return cls(**made)
+TrainOptions: type[StageOptions] = train_options(NERFACTO.name)
+"""`TrainConfig` with the options of the default method, checked."""
+
+EvaluateOptions: type[StageOptions] = _model_of(EvaluateConfig)
+"""`EvaluateConfig`, checked."""
 
 
 def train_config(options: StageOptions) -> TrainConfig:
     """What `pipelines.nerf` understands, from checked options."""
-    config: TrainConfig = build_dataclass(TrainConfig, options.model_dump())
+    config: TrainConfig = config_from_dict(TrainConfig, options.model_dump())
+    return config
+
+
+def evaluate_config(options: StageOptions) -> EvaluateConfig:
+    """What the evaluation understands, from checked options."""
+    config: EvaluateConfig = config_from_dict(EvaluateConfig, options.model_dump())
     return config
 
 
@@ -333,7 +344,7 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
     preset: a key of `PRESETS`. overrides: nested `{stage: {option: value}}`.
     Raises OptionsError naming each wrong option, and KeyError for an unknown preset.
     """
-    wanted = PRESETS[preset].overrides
+    wanted = dict(PRESETS[preset].overrides)
     errors: list[tuple[str, str]] = [
         (name, f"no such stage; there are {', '.join(STAGE_NAMES)}")
         for name in overrides
@@ -345,9 +356,20 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
         if not isinstance(given, dict):
             errors.append((name, "expected an object of options"))
             continue
-        base = model().model_dump(mode="json")
         try:
+            if name == "train":
+                model, base, wanted["train"] = _train_ground(given, wanted.get("train", {}))
+            else:
+                base = model().model_dump(mode="json")
             checked = model.model_validate(merge(merge(base, wanted.get(name, {})), given))
+            if name == "train":
+                validate(train_config(checked))
+        except OptionsError as error:
+            errors += error.errors
+            continue
+        except NerfError as error:
+            errors.append(("train", error.message))
+            continue
         except ValidationError as error:
             for item in error.errors():
                 path = ".".join(str(part) for part in (name, *item["loc"]))
@@ -359,8 +381,26 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
     return resolved
 
 
+def _train_ground(
+    given: dict[str, Any], wanted: dict[str, Any]
+) -> tuple[type[StageOptions], dict[str, Any], dict[str, Any]]:
+    """For the method that is asked for: its options, their defaults, and what the preset changes.
+
+    Presets are made for Nerfacto; of their training options another method takes those that are
+    not about the model and its optimiser.
+    """
+    method = given.get("method", NERFACTO.name)
+    model = train_options(str(method))
+    base = model.model_validate(_plain(default_train_config(method))).model_dump(mode="json")
+    if method != NERFACTO.name:
+        wanted = {key: value for key, value in wanted.items() if key not in ("model", "optimizer")}
+    return model, base, wanted
+
+
 def stage_options(stage: str, values: dict[str, Any]) -> StageOptions:
     """The checked options of one stage from plain values."""
+    if stage == "train":
+        return train_options(str(values.get("method", NERFACTO.name))).model_validate(values)
     return STAGE_OPTIONS[stage].model_validate(values)
 
 

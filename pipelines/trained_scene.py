@@ -24,7 +24,7 @@ from pipelines.errors import ExportError, PipelineError
 from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.checkpoint import load_model
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.models.base import Appearance, Model
 from pipelines.nerf.renderer import RenderedImage, Renderer
 from pipelines.nerf.training import choose_device
 from pipelines.scene_bounds import SceneBounds, scene_bounds
@@ -100,9 +100,10 @@ class TrainedScene:
     """
 
     def __init__(
-        self, model: Nerfacto, scene: SceneTransform, cameras: CamerasFile, extras: dict[str, Any]
+        self, model: Model, scene: SceneTransform, cameras: CamerasFile, extras: dict[str, Any]
     ) -> None:
         use_all_cores()
+        self.model = model
         self.scene = scene
         self.cameras = cameras
         self.extras = extras
@@ -128,11 +129,22 @@ class TrainedScene:
         """The lens of an image, for its full size."""
         return self.cameras.cameras[image.camera]
 
-    def render(self, lens: Intrinsics, pose: Floats, long_side: int | None = None) -> RenderedImage:
-        """What a lens, distortion and all, sees from a world pose, at its own or a smaller size."""
+    def render(
+        self,
+        lens: Intrinsics,
+        pose: Floats,
+        long_side: int | None = None,
+        *,
+        appearance: Appearance = None,
+    ) -> RenderedImage:
+        """What a lens, distortion and all, sees from a world pose, at its own or a smaller size.
+
+        appearance: a code [A], the training image whose code to use, or None for the mean code.
+        """
         with nerf_errors_as(ExportError):
             cameras = nerf_cameras([lens], [pose], self.scene)
-            return self._renderer.render(cameras.resized(long_side) if long_side else cameras, 0)
+            sized = cameras.resized(long_side) if long_side else cameras
+            return self._renderer.render(sized, 0, appearance=appearance)
 
     def picture(self, lens: Pinhole, pose: Floats) -> NDArray[np.uint8]:
         """[H, W, 3] uint8: an undistorted picture."""

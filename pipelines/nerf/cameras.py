@@ -2,14 +2,16 @@
 
 Frames and units are those of README.md: camera axes are OpenGL (+X right, +Y up, looks along -Z),
 the centre of the top-left pixel is (0.5, 0.5), rays have unit directions in scene space. Lenses:
-PINHOLE, OPENCV (radial k1..k4 as powers r^2..r^8, tangential p1, p2) and OPENCV_FISHEYE (angular
-k1..k4 as powers theta^2..theta^8).
+PINHOLE, OPENCV (radial k1..k4 as powers r^2..r^8, tangential p1, p2), OPENCV_FISHEYE (angular
+k1..k4 as powers theta^2..theta^8) and EQUIRECTANGULAR (columns are longitudes, rows latitudes; the
+middle looks along -Z). `lenses` has their formulas; one batch may mix them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,18 +19,31 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.lenses import distort, undistort
+from pipelines.nerf.lenses import (
+    CAMERA_MODELS,
+    EQUIRECTANGULAR,
+    OPENCV,
+    PINHOLE,
+    distort,
+    undistort,
+)
 from pipelines.nerf.rays import Rays
 
 MAX_SKEW = 1e-3
 """Largest departure of R R^T from the identity that still counts as rounding."""
-CAMERA_MODELS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE")
+MAX_PANORAMA = 1.01
+"""Share of the sphere that an equirectangular picture may cover: all of it, and rounding."""
 
 
 def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
     """(width, height) with the longer side at most `long_side`; never larger than it was."""
     scale = min(1.0, long_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def panorama_intrinsics(width: int, height: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(focal, principal) in px of an EQUIRECTANGULAR picture that shows the whole sphere."""
+    return (width / 2, float(height)), (width / 2, height / 2)
 
 
 @dataclass(frozen=True)
@@ -78,8 +93,10 @@ class Cameras:
 
     scene_from_camera: [N, 3, 4] float32, rotation and camera centre.
     focal: [N, 2] float32, px. principal: [N, 2] float32, px. size: [N, 2] int64, width and height.
-    distortion: [N, 6] float32: k1, k2, k3, k4, p1, p2. fisheye: [N] bool.
-    distorted: whether any lens needs more than the pinhole formula.
+    distortion: [N, 6] float32: k1, k2, k3, k4, p1, p2.
+    model: [N] int64, positions in `CAMERA_MODELS`. kinds: the lens formulas that occur, without
+    OPENCV where all its terms are 0; held here so that no device has to be asked.
+    times: [N] float32 in [0, 1], when each picture was taken, or None in a scene that stands still.
     """
 
     scene_from_camera: Tensor
@@ -87,8 +104,9 @@ class Cameras:
     principal: Tensor
     size: Tensor
     distortion: Tensor
-    fisheye: Tensor
-    distorted: bool
+    model: Tensor
+    kinds: tuple[int, ...]
+    times: Tensor | None = None
 
     @classmethod
     def from_arrays(
@@ -102,28 +120,25 @@ class Cameras:
         principal: ArrayLike,
         models: Sequence[str] | None = None,
         distortion: ArrayLike | None = None,
+        times: ArrayLike | None = None,
     ) -> Cameras:
         """Cameras from plain numbers, brought to scene space in float64.
 
-        world_from_camera: [N, 3, 4], world units. widths, heights: [N]. focal, principal: [N, 2].
-        models: N of `CAMERA_MODELS`, default PINHOLE. distortion: [N, 6]: k1, k2, k3, k4, p1, p2.
+        world_from_camera: [N, 3, 4], world units. widths, heights: [N]. focal, principal: [N, 2],
+        px; see `panorama_intrinsics`. models: N of `CAMERA_MODELS`, default PINHOLE.
+        distortion: [N, 6]: k1, k2, k3, k4, p1, p2. times: [N] in [0, 1].
         Raises NerfError `bad_cameras` naming what is wrong.
         """
-        poses = np.array(world_from_camera, dtype=np.float64)
+        poses = _checked_poses(world_from_camera)
         num = len(poses)
-        _require(poses.shape == (num, 3, 4) and num > 0, "world_from_camera is not [N, 3, 4]")
-        _require(bool(np.isfinite(poses).all()), "world_from_camera is not finite")
-        turns = poses[:, :, :3]
-        skewed = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max() > MAX_SKEW
-        mirrored = (np.linalg.det(turns) <= 0.0).any()
-        _require(not (skewed or mirrored), "world_from_camera holds more than a rotation")
         poses[:, :, 3] = scene.scene_from_world(poses[:, :, 3])
         names = ["PINHOLE"] * num if models is None else list(models)
         _require(len(names) == num, "models has another length than world_from_camera")
         for name in names:
             _require(name in CAMERA_MODELS, f"model {name} is none of {', '.join(CAMERA_MODELS)}")
+        model = np.array([CAMERA_MODELS.index(name) for name in names])
         terms = np.zeros((num, 6)) if distortion is None else np.array(distortion, np.float64)
-        terms[[name == "PINHOLE" for name in names]] = 0.0
+        terms[(model == PINHOLE) | (model == EQUIRECTANGULAR)] = 0.0
         size = np.stack([np.asarray(widths), np.asarray(heights)], axis=-1).astype(np.int64)
         focal_px, principal_px = np.array(focal, np.float64), np.array(principal, np.float64)
         for label, array, width in (
@@ -135,37 +150,41 @@ class Cameras:
             _require(array.shape == (num, width), f"{label} is not [N, {width}]")
             _require(bool(np.isfinite(array).all()), f"{label} is not finite")
         _require(bool((size > 0).all() and (focal_px > 0).all()), "a size or focal is not positive")
+        _check_panoramas(model, size, focal_px, principal_px)
+        plain = (model == OPENCV) & (terms == 0.0).all(axis=-1)
         return cls(
             scene_from_camera=torch.from_numpy(poses).float(),
             focal=torch.from_numpy(focal_px).float(),
             principal=torch.from_numpy(principal_px).float(),
             size=torch.from_numpy(size),
             distortion=torch.from_numpy(terms).float(),
-            fisheye=torch.tensor([name == "OPENCV_FISHEYE" for name in names]),
-            distorted=bool(np.any(terms != 0.0)) or "OPENCV_FISHEYE" in names,
+            model=torch.from_numpy(model),
+            kinds=tuple(np.unique(np.where(plain, PINHOLE, model)).tolist()),
+            times=None if times is None else torch.from_numpy(_checked_times(times, num)).float(),
         )
 
     def __len__(self) -> int:
         return self.scene_from_camera.shape[0]
 
+    @property
+    def distorted(self) -> bool:
+        """Whether any lens needs more than the pinhole formula."""
+        return self.kinds != (PINHOLE,)
+
     def select(self, indices: Sequence[int]) -> Cameras:
         """The cameras at these positions, in this order."""
         rows = torch.tensor(list(indices), dtype=torch.int64)
-        tensors = {
-            item.name: getattr(self, item.name)[rows]
-            for item in fields(self)
-            if item.name != "distorted"
-        }
-        return Cameras(**tensors, distorted=self.distorted)
+        return self._map(lambda values: values[rows])
 
     def to(self, device: torch.device | str) -> Cameras:
         """The cameras on another device."""
-        tensors = {
-            item.name: getattr(self, item.name).to(device)
-            for item in fields(self)
-            if item.name != "distorted"
+        return self._map(lambda values: values.to(device))
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Cameras:
+        changed: dict[str, Any] = {
+            name: change(value) for name, value in vars(self).items() if isinstance(value, Tensor)
         }
-        return Cameras(**tensors, distorted=self.distorted)
+        return replace(self, **changed)
 
     def resized(self, long_side: int) -> Cameras:
         """The same views with images of at most that long side, in pixels."""
@@ -194,38 +213,41 @@ class Cameras:
             directions=directions,
             camera_indices=camera_indices,
             pixel_area=area,
+            times=None if self.times is None else self.times[camera_indices],
         )
 
-    def image_rays(self, index: int) -> Rays:
+    def image_rays(self, index: int, *, with_pixel_area: bool = False) -> Rays:
         """The rays through all pixel centres of one camera, row by row: R = height * width."""
         width, height = self.size[index].tolist()
         device = self.size.device
-        x = torch.arange(width, device=device, dtype=torch.float32) + 0.5
-        y = torch.arange(height, device=device, dtype=torch.float32) + 0.5
+        x = torch.arange(width, device=device, dtype=self.focal.dtype) + 0.5
+        y = torch.arange(height, device=device, dtype=self.focal.dtype) + 0.5
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
         indices = torch.full((len(pixels),), index, dtype=torch.int64, device=device)
-        return self.generate_rays(indices, pixels)
+        return self.generate_rays(indices, pixels, with_pixel_area=with_pixel_area)
 
     def project(self, points: Tensor, camera_indices: Tensor) -> tuple[Tensor, Tensor]:
         """Where points appear.
 
         points: [P, 3], scene units. camera_indices: [P] int64.
         Returns (pixels [P, 2], z_depth [P]); z_depth is along the optical axis, scene units, not
-        positive behind the camera, where only a fisheye's pixels mean anything.
+        positive behind the camera, where only the pixels of a fisheye and of a panorama mean
+        anything.
         """
         pose = self.scene_from_camera[camera_indices]
         local = (pose[:, :, :3].transpose(1, 2) @ (points - pose[:, :, 3])[..., None]).squeeze(-1)
         # OpenCV's axes, in which lens formulas are written: y down, z forward.
         local = local * torch.tensor([1.0, -1.0, -1.0], dtype=local.dtype, device=local.device)
-        plane = distort(local, self.distortion[camera_indices], self.fisheye[camera_indices])
+        terms, model = self.distortion[camera_indices], self.model[camera_indices]
+        plane = distort(local, terms, model, self.kinds)
         return plane * self.focal[camera_indices] + self.principal[camera_indices], local[:, 2]
 
     def _directions(self, camera_indices: Tensor, pixels: Tensor) -> Tensor:
         """Unit directions [R, 3] in scene space."""
         plane = (pixels - self.principal[camera_indices]) / self.focal[camera_indices]
         if self.distorted:
-            terms, fisheye = self.distortion[camera_indices], self.fisheye[camera_indices]
-            local = undistort(plane, terms, fisheye)
+            terms, model = self.distortion[camera_indices], self.model[camera_indices]
+            local = undistort(plane, terms, model, self.kinds)
         else:
             local = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=-1)
         local = local * torch.tensor([1.0, -1.0, -1.0], dtype=local.dtype, device=local.device)
@@ -236,3 +258,42 @@ class Cameras:
 def _require(condition: bool, problem: str) -> None:
     if not condition:
         raise NerfError("bad_cameras", f"The cameras cannot be used: {problem}.", "Check poses.")
+
+
+def _checked_poses(world_from_camera: ArrayLike) -> NDArray[np.float64]:
+    """A float64 copy [N, 3, 4]."""
+    poses = np.array(world_from_camera, dtype=np.float64)
+    num = len(poses)
+    _require(poses.shape == (num, 3, 4) and num > 0, "world_from_camera is not [N, 3, 4]")
+    _require(bool(np.isfinite(poses).all()), "world_from_camera is not finite")
+    turns = poses[:, :, :3]
+    skewed = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max() > MAX_SKEW
+    mirrored = (np.linalg.det(turns) <= 0.0).any()
+    _require(not (skewed or mirrored), "world_from_camera holds more than a rotation")
+    return poses
+
+
+def _checked_times(times: ArrayLike, num: int) -> NDArray[np.float64]:
+    """A float64 copy [N]."""
+    seen = np.array(times, dtype=np.float64)
+    _require(seen.shape == (num,), "times is not [N]")
+    _require(bool(((seen >= 0.0) & (seen <= 1.0)).all()), "times leaves [0, 1]")
+    return seen
+
+
+def _check_panoramas(
+    model: NDArray[np.int64],
+    size: NDArray[np.int64],
+    focal: NDArray[np.float64],
+    principal: NDArray[np.float64],
+) -> None:
+    """Refuse equirectangular pictures whose focal makes them wrap around more than once."""
+    rows = model == EQUIRECTANGULAR
+    around = size[rows, 0] / (2.0 * focal[rows, 0])
+    above, below = principal[rows, 1], size[rows, 1] - principal[rows, 1]
+    upright = 2.0 * np.maximum(above, below) / focal[rows, 1]
+    _require(
+        bool((around <= MAX_PANORAMA).all() and (upright <= MAX_PANORAMA).all()),
+        "an EQUIRECTANGULAR picture covers more than the sphere; a whole one has focal "
+        "(width / 2, height) px",
+    )

@@ -20,12 +20,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from pipelines.nerf.cameras import SceneTransform
-from pipelines.nerf.config import NerfactoConfig, config_from_dict
+from pipelines.nerf.config import config_from_dict, find_method
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.models.base import Model
 
-CHECKPOINT_VERSION = 1
-MODEL_VERSION = 1
+CHECKPOINT_VERSION = 2
+MODEL_VERSION = 2
+READABLE_MODEL_VERSIONS = (1, 2)
+"""Version 1 had one method, Nerfacto, and did not name it."""
 WEIGHTS_NAME, DESCRIPTION_NAME = "model.safetensors", "model.json"
 
 
@@ -81,12 +83,12 @@ class LoadedModel:
     extras: JSON that the writer added, such as the cameras.
     """
 
-    model: Nerfacto
+    model: Model
     scene: SceneTransform
     extras: dict[str, Any]
 
 
-def save_model(path: Path, model: Nerfacto, scene: SceneTransform, extras: dict[str, Any]) -> None:
+def save_model(path: Path, model: Model, scene: SceneTransform, extras: dict[str, Any]) -> None:
     """Write everything that is needed to render again without the capture.
 
     extras: JSON-able; given back by `load_model` as it is. The entries are stored, not deflated:
@@ -94,6 +96,7 @@ def save_model(path: Path, model: Nerfacto, scene: SceneTransform, extras: dict[
     """
     description = {
         "version": MODEL_VERSION,
+        "method": model.method,
         "config": asdict(model.config),
         "num_train_images": model.num_train_images,
         "scene": asdict(scene),
@@ -114,19 +117,19 @@ def load_model(path: Path) -> LoadedModel:
     """Read what `save_model` wrote.
 
     Raises NerfError `bad_model_file` where the file is damaged, incomplete or of another version,
-    and FileNotFoundError where there is none.
+    `bad_config` where its method is not installed, and FileNotFoundError where there is none.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             description = json.loads(archive.read(DESCRIPTION_NAME))
             weights = load(archive.read(WEIGHTS_NAME))
-        if description["version"] != MODEL_VERSION:
+        if description["version"] not in READABLE_MODEL_VERSIONS:
             raise _bad_model(path, f"has version {description['version']}, not {MODEL_VERSION}")
-        config: NerfactoConfig = config_from_dict(NerfactoConfig, description["config"])
-        # Made without memory, then given the weights: no random start that is thrown away.
-        with torch.device("meta"):
-            model = Nerfacto(config, int(description["num_train_images"]))
-        model.load_state_dict(weights, strict=True, assign=True)
+        method = find_method(description.get("method", "nerfacto"))
+        config = config_from_dict(method.config, description["config"])
+        with torch.random.fork_rng(devices=[]):
+            model: Model = method.build(config, int(description["num_train_images"]))
+        model.load_state_dict(weights, strict=True)
         raw = description["scene"]
         x, y, z = (float(value) for value in raw["center"])
         scene = SceneTransform(center=(x, y, z), scale=float(raw["scale"]))
@@ -137,7 +140,7 @@ def load_model(path: Path) -> LoadedModel:
     return LoadedModel(model=model.eval(), scene=scene, extras=extras)
 
 
-def _named(model: Nerfacto) -> dict[str, torch.Tensor]:
+def _named(model: Model) -> dict[str, torch.Tensor]:
     return dict(model.state_dict())
 
 

@@ -1,9 +1,9 @@
 """Every option of the NeRF and its default, once: plain dataclasses, no torch, no pydantic.
 
 `metadata` carries what people and the API need: `help`, and where it applies `unit`, `ge`, `le`,
-`choices`. `pipelines.options` turns these classes into checked pydantic models. Defaults are the
-paper's Nerfacto as its authors ship it (nerfstudio 1.1.5); a comment gives the reason for each
-departure.
+`choices`, and `plugins`: the kind of component that other packages may add to the choices.
+`pipelines.options` turns these classes into checked pydantic models. Defaults are the paper's
+Nerfacto as its authors ship it (nerfstudio 1.1.5); a comment gives the reason for each departure.
 """
 
 from __future__ import annotations
@@ -13,23 +13,44 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any
 
+from pipelines.nerf.config_methods import INSTANT_NGP, NERF, InstantNgpConfig, NerfConfig
+from pipelines.nerf.config_parts import (
+    HashGridConfig,
+    ModelConfig,
+    allowed_names,
+    bad_option,
+    check_grid,
+    check_spacing,
+    contraction_option,
+    option,
+    spacing_option,
+)
 from pipelines.nerf.errors import NerfError
+from pipelines.nerf.plugins import Method, plugin_methods
 
-
-def option(default: Any, help: str, **bounds: Any) -> Any:
-    """A dataclass field with its meaning; `bounds`: unit, ge, le, choices."""
-    return field(default=default, metadata={"help": help, **bounds})
-
-
-@dataclass(frozen=True)
-class HashGridConfig:
-    """A multi-resolution hash grid (Instant-NGP, arXiv:2201.05989)."""
-
-    num_levels: int = option(16, "Number of resolution levels.", ge=1, le=32)
-    min_res: int = option(16, "Cells per side of the coarsest level.", ge=2, le=1024)
-    max_res: int = option(2048, "Cells per side of the finest level.", ge=2, le=65536)
-    log2_table_size: int = option(19, "log2 of the entries per level.", ge=8, le=24)
-    features_per_level: int = option(2, "Features per entry.", ge=1, le=8)
+__all__ = [
+    "BUILT_IN_METHODS",
+    "NERFACTO",
+    "DataConfig",
+    "HashGridConfig",
+    "InstantNgpConfig",
+    "ModelConfig",
+    "NerfConfig",
+    "NerfactoConfig",
+    "OptimizerConfig",
+    "ProposalConfig",
+    "TensorGridConfig",
+    "TrainConfig",
+    "allowed_names",
+    "bad_option",
+    "check_grid",
+    "config_from_dict",
+    "default_train_config",
+    "find_method",
+    "methods",
+    "option",
+    "validate",
+]
 
 
 @dataclass(frozen=True)
@@ -55,11 +76,17 @@ def _default_proposals() -> tuple[ProposalConfig, ...]:
 
 
 @dataclass(frozen=True)
-class NerfactoConfig:
-    """The model (paper, section 5; defaults of nerfstudio 1.1.5)."""
+class TensorGridConfig:
+    """Position encodings other than the hash grid: CP, VM and the dense voxel grid."""
 
-    near: float = option(0.05, "Nearest sample.", unit="scene units", ge=0.0, le=10.0)
-    far: float = option(1000.0, "Farthest sample.", unit="scene units", ge=1.0, le=1e6)
+    resolution: int = option(128, "Vertices per side.", ge=2, le=2048)
+    num_components: int = option(16, "Components (CP, per mode of VM) or features.", ge=1, le=512)
+
+
+@dataclass(frozen=True)
+class NerfactoConfig(ModelConfig):
+    """The paper's default method (section 5; defaults of nerfstudio 1.1.5)."""
+
     num_proposal_samples: tuple[int, ...] = option(
         (256, 96), "Samples per ray of each proposal round.", ge=1, le=4096
     )
@@ -68,34 +95,64 @@ class NerfactoConfig:
         default_factory=_default_proposals, metadata={"help": "The proposal networks."}
     )
     share_proposal_network: bool = option(False, "Use the first network in every round.")
+    spacing: str = spacing_option()
+    position_encoding: str = option(
+        "hash",
+        "What the field sees of a place.",
+        choices=("hash", "vm", "cp", "voxel", "fourier"),
+        plugins="position_encoding",
+    )
     grid: HashGridConfig = field(
         default_factory=HashGridConfig, metadata={"help": "The field's hash grid."}
+    )
+    tensor_grid: TensorGridConfig = field(
+        default_factory=TensorGridConfig,
+        metadata={"help": "The field's grid where position_encoding is vm, cp or voxel."},
+    )
+    direction_encoding: str = option(
+        "spherical_harmonics",
+        "What the field sees of a direction.",
+        choices=("spherical_harmonics", "fourier"),
+        plugins="direction_encoding",
     )
     hidden_dim: int = option(64, "Width of the density MLP.", ge=1, le=1024)
     hidden_dim_color: int = option(64, "Width of the colour MLP.", ge=1, le=1024)
     geo_feature_dim: int = option(15, "Features from density to colour.", ge=1, le=256)
     appearance_dim: int = option(32, "Size of the per-image code; 0 for none.", ge=0, le=256)
-    contraction: str = option(
-        "linf", "How unbounded space is bounded.", choices=("linf", "l2", "none")
-    )
-    background: str = option(
-        "last_sample",
-        "Colour behind the last sample.",
-        choices=("last_sample", "black", "white", "random"),
-    )
+    contraction: str = contraction_option()
     average_init_density: float = option(0.01, "Scale of density at the start.", ge=1e-6, le=1e3)
     single_jitter: bool = option(True, "One random offset per ray instead of one per sample.")
-    camera_mode: str = option("so3xr3", "Camera optimisation.", choices=("off", "so3xr3", "se3"))
-    camera_translation_penalty: float = option(1e-2, "Weight on moved cameras.", ge=0.0, le=1e3)
-    camera_rotation_penalty: float = option(1e-3, "Weight on turned cameras.", ge=0.0, le=1e3)
     interlevel_weight: float = option(1.0, "Weight of the interlevel loss.", ge=0.0, le=1e3)
     distortion_weight: float = option(0.002, "Weight of the distortion loss.", ge=0.0, le=1e3)
+    predict_normals: bool = option(
+        False, "Learn normals too; training takes several times as long."
+    )
+    orientation_weight: float = option(1e-4, "Weight of the orientation loss.", ge=0.0, le=1e3)
+    predicted_normal_weight: float = option(
+        1e-3, "Weight of the predicted normals' loss.", ge=0.0, le=1e3
+    )
     anneal_steps: int = option(1000, "Steps over which proposal weights sharpen.", ge=0, le=10**6)
     anneal_slope: float = option(10.0, "Slope of that sharpening.", ge=0.0, le=1e3)
     proposal_warmup_steps: int = option(
         5000, "Steps over which proposal updates become rarer.", ge=1, le=10**7
     )
     proposal_update_every: int = option(5, "Steps between proposal updates then.", ge=1, le=1000)
+
+    def check(self, path: str) -> None:
+        """As `ModelConfig.check`."""
+        super().check(path)
+        rounds, networks = len(self.num_proposal_samples), len(self.proposals)
+        if rounds < 1 or networks < 1:
+            raise bad_option(f"{path}.proposals", networks, "at least one network and one round")
+        if networks < rounds and not self.share_proposal_network:
+            allowed = (
+                f"at least the {rounds} rounds of num_proposal_samples, or share_proposal_network"
+            )
+            raise bad_option(f"{path}.proposals", f"{networks} networks", allowed)
+        check_grid(f"{path}.grid", self.grid)
+        for index, proposal in enumerate(self.proposals):
+            check_grid(f"{path}.proposals.{index}.grid", proposal.grid)
+        check_spacing(path, self.spacing, self.near)
 
 
 @dataclass(frozen=True)
@@ -104,12 +161,31 @@ class DataConfig:
 
     long_side_px: int = option(1600, "Images are reduced to this.", unit="px", ge=32, le=16384)
     eval_mode: str = option(
-        "fraction", "How held-out images are chosen.", choices=("fraction", "interval", "none")
+        "fraction",
+        "How held-out images are chosen: `fraction` at equal intervals, `interval` every n-th, "
+        "`stretch` neighbours along the path.",
+        choices=("fraction", "interval", "stretch", "none"),
     )
     eval_fraction: float = option(
         0.1, "Share held out, at equal intervals, at least 5 images.", ge=0.0, le=0.9
     )
     eval_interval: int = option(8, "With `interval`: every n-th image is held out.", ge=2, le=1000)
+    eval_stretch_fraction: float = option(
+        0.1, "With `stretch`: share held out, at least 5 images.", ge=0.0, le=0.9
+    )
+    eval_stretch_place: float = option(
+        0.5, "Where the stretch lies: 0 at the path's start, 1 at its end.", ge=0.0, le=1.0
+    )
+    max_memory_gib: float = option(
+        32.0,
+        "Most memory that the images may take, 3 bytes a pixel, 4 with masks; more is refused.",
+        unit="GiB",
+        ge=0.01,
+        le=4096.0,
+    )
+    images_on_gpu: bool = option(
+        False, "Hold the images on the GPU and draw pixels there; on a CPU it changes nothing."
+    )
     scale_poses: bool = option(True, "Scale the scene so that cameras lie in [-1, 1]^3.")
 
 
@@ -130,7 +206,7 @@ class OptimizerConfig:
 class TrainConfig:
     """A whole training run."""
 
-    method: str = option("nerfacto", "The model.", choices=("nerfacto",))
+    method: str = option("nerfacto", "The method; its options are those of `model`.")
     max_steps: int = option(30_000, "Optimiser steps.", unit="steps", ge=1, le=10**7)
     max_seconds: float = option(
         0.0, "Stop after this much training time; 0 for no limit.", unit="s", ge=0.0, le=10**7
@@ -148,7 +224,7 @@ class TrainConfig:
         "`fast` uses compiled kernels, `plain` the PyTorch definitions.",
         choices=("auto", "plain", "fast"),
     )
-    model: NerfactoConfig = field(
+    model: ModelConfig = field(
         default_factory=NerfactoConfig, metadata={"help": "The model's options."}
     )
     data: DataConfig = field(default_factory=DataConfig, metadata={"help": "The data's options."})
@@ -157,52 +233,76 @@ class TrainConfig:
     )
 
 
+NERFACTO = Method(
+    name="nerfacto",
+    summary="The paper's default method: fast, unbounded, for real captures.",
+    config=NerfactoConfig,
+    model="pipelines.nerf.models.nerfacto:Nerfacto",
+)
+BUILT_IN_METHODS = (NERFACTO, INSTANT_NGP, NERF)
+
+
+def methods() -> dict[str, Method]:
+    """Every method by name, the built-in ones first. Raises NerfError `bad_plugin`."""
+    return {method.name: method for method in BUILT_IN_METHODS} | plugin_methods()
+
+
+def find_method(name: str) -> Method:
+    """The method of a name. Raises NerfError `bad_config` with the names there are."""
+    known = methods()
+    if name not in known:
+        raise bad_option("train.method", name, ", ".join(known))
+    return known[name]
+
+
+def default_train_config(method: str) -> TrainConfig:
+    """A run of a method with its own defaults."""
+    chosen = find_method(method)
+    config: TrainConfig = _with_values(
+        TrainConfig(method=method, model=chosen.config()), chosen.train
+    )
+    return config
+
+
+def _with_values(config: Any, values: typing.Mapping[str, Any]) -> Any:
+    """A dataclass with nested plain values laid over it."""
+    changes = {
+        name: _with_values(getattr(config, name), value)
+        if isinstance(value, typing.Mapping)
+        else value
+        for name, value in values.items()
+    }
+    return dataclasses.replace(config, **changes)
+
+
 def validate(config: TrainConfig) -> None:
     """Check every value against its bounds, and the values against each other.
 
     Raises NerfError `bad_config` that names the option, its value and what is allowed.
     """
+    wanted = find_method(config.method).config
+    if not isinstance(config.model, wanted):
+        raise bad_option("train.model", type(config.model).__name__, wanted.__name__)
     _check_fields(config, "train")
-    model = config.model
-    rounds, networks = len(model.num_proposal_samples), len(model.proposals)
-    if rounds < 1 or networks < 1:
-        raise _bad("train.model.proposals", networks, "at least one network and one round")
-    if networks < rounds and not model.share_proposal_network:
-        allowed = f"at least the {rounds} rounds of num_proposal_samples, or share_proposal_network"
-        raise _bad("train.model.proposals", f"{networks} networks", allowed)
-    if model.near >= model.far:
-        raise _bad("train.model.near", model.near, f"less than far ({model.far})")
-    grids = {"train.model.grid": model.grid}
-    grids |= {f"train.model.proposals.{i}.grid": p.grid for i, p in enumerate(model.proposals)}
-    for path, grid in grids.items():
-        if grid.max_res < grid.min_res:
-            raise _bad(f"{path}.max_res", grid.max_res, f"at least min_res ({grid.min_res})")
-
-
-def _bad(path: str, value: object, allowed: str) -> NerfError:
-    return NerfError(
-        "bad_config",
-        f"The option {path} is {value!r}; allowed: {allowed}.",
-        f"Set {path} to an allowed value.",
-    )
+    config.model.check("train.model")
 
 
 def _check_fields(config: Any, path: str) -> None:
-    """Bounds and choices of one dataclass and of those inside it."""
+    """Bounds and names of one dataclass and of those inside it."""
     for item in dataclasses.fields(config):
         value, name = getattr(config, item.name), f"{path}.{item.name}"
         if dataclasses.is_dataclass(value):
             _check_fields(value, name)
             continue
-        choices = item.metadata.get("choices")
+        choices = allowed_names(item.metadata)
         if choices and value not in choices:
-            raise _bad(name, value, ", ".join(choices))
+            raise bad_option(name, value, ", ".join(choices))
         low, high = item.metadata.get("ge"), item.metadata.get("le")
         for part in value if isinstance(value, tuple) else (value,):
             if dataclasses.is_dataclass(part):
                 _check_fields(part, name)
             elif low is not None and not low <= part <= high:
-                raise _bad(name, value, f"{low} to {high}")
+                raise bad_option(name, value, f"{low} to {high}")
 
 
 def config_from_dict(cls: Any, values: dict[str, Any]) -> Any:
@@ -211,6 +311,8 @@ def config_from_dict(cls: Any, values: dict[str, Any]) -> Any:
     Raises NerfError `bad_config` for an unknown option.
     """
     hints = typing.get_type_hints(cls)
+    if cls is TrainConfig:
+        hints["model"] = find_method(values.get("method", "nerfacto")).config
     made: dict[str, Any] = {}
     for name, value in values.items():
         if name not in hints:

@@ -1,14 +1,16 @@
 """Training images in memory, the held-out split, and batches of random pixels.
 
-Images are held as uint8 in one flat buffer, so that they may differ in size and cost three bytes a
-pixel. They arrive upright: EXIF orientation is not looked at here. Symbols: N images, B pixels.
+Images are held once, as uint8 in one flat buffer, so that they may differ in size: three bytes a
+pixel, four with masks (`memory_bytes`), however many there are. The buffer is taken before the
+first picture is decoded, and one decoded picture at a time is held beside it. Images arrive
+upright: EXIF orientation is not looked at here. Symbols: N images, B pixels.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,9 @@ from pipelines.nerf.errors import NerfError
 
 MIN_HELD_OUT = 5
 MASK_THRESHOLD = 128
+BLOCK_PIXELS = 64
+"""Pixels of a mask that are counted together, so that its usable pixels need no list of their own:
+the counts take 3/8 of a byte a pixel, where positions would take 8."""
 
 
 def split_indices(num_images: int, config: DataConfig) -> tuple[list[int], list[int]]:
@@ -30,18 +35,21 @@ def split_indices(num_images: int, config: DataConfig) -> tuple[list[int], list[
 
     `fraction`: training takes int(linspace(0, N - 1, n)) with n = ceil((1 - f) N), the rest is held
     out; where that leaves fewer than 5, n is lowered until 5 are held out, or a quarter of a small
-    capture. `interval`: indices 0, k, 2k... are held out. `none`: nothing is.
-    Raises NerfError `too_few_images` where nothing is left to train on.
+    capture. `interval`: indices 0, k, 2k... are held out. `stretch`: as many neighbours as
+    `fraction` would hold out, starting int(place * (N - held out)) images along the path. `none`:
+    nothing is. Raises NerfError `too_few_images` where nothing is left to train on.
     """
     everything = list(range(num_images))
     if config.eval_mode == "interval":
         test = everything[:: config.eval_interval]
     elif config.eval_mode == "fraction" and config.eval_fraction > 0.0:
-        # The small term keeps (1 - 0.1) * 50 = 45.00000000000001 from becoming 46.
-        num_train = math.ceil((1.0 - config.eval_fraction) * num_images - 1e-9)
-        num_train = min(num_train, num_images - min(MIN_HELD_OUT, num_images // 4))
+        num_train = num_images - _num_held_out(num_images, config.eval_fraction)
         chosen = set(np.linspace(0, num_images - 1, num_train, dtype=np.int64).tolist())
         test = [index for index in everything if index not in chosen]
+    elif config.eval_mode == "stretch" and config.eval_stretch_fraction > 0.0:
+        num_test = _num_held_out(num_images, config.eval_stretch_fraction)
+        first = int(config.eval_stretch_place * (num_images - num_test))
+        test = everything[first : first + num_test]
     else:
         test = []
     held_out = set(test)
@@ -53,6 +61,18 @@ def split_indices(num_images: int, config: DataConfig) -> tuple[list[int], list[
             "Send more images, or set train.data.eval_mode to none.",
         )
     return train, test
+
+
+def _num_held_out(num_images: int, fraction: float) -> int:
+    """N - ceil((1 - f) N), at least 5 or a quarter of a small capture."""
+    # The small term keeps (1 - 0.1) * 50 = 45.00000000000001 from becoming 46.
+    num_train = math.ceil((1.0 - fraction) * num_images - 1e-9)
+    return max(num_images - num_train, min(MIN_HELD_OUT, num_images // 4))
+
+
+def memory_bytes(sizes: Sequence[tuple[int, int]], *, masked: bool) -> int:
+    """What `ImageData` takes for pictures of these (width, height): 3 bytes a pixel, 4 masked."""
+    return (4 if masked else 3) * sum(width * height for width, height in sizes)
 
 
 @dataclass(frozen=True)
@@ -72,11 +92,58 @@ class ImageData:
     def __len__(self) -> int:
         return self.sizes.shape[0]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of `pixels` and `valid`; `memory_bytes` tells them in advance."""
+        return self.pixels.nbytes + (0 if self.valid is None else self.valid.nbytes)
+
     def image(self, index: int) -> Tensor:
         """One image as [H, W, 3] float32 in [0, 1]."""
         width, height = self.sizes[index].tolist()
-        rows = self.pixels[int(self.offsets[index]) : int(self.offsets[index + 1])]
-        return rows.reshape(height, width, 3).float() / 255.0
+        return self.pixels[self._rows(index)].reshape(height, width, 3).float() / 255.0
+
+    def mask(self, index: int) -> Tensor | None:
+        """The usable pixels of one image as [H, W] bool, or None where there are no masks."""
+        if self.valid is None:
+            return None
+        width, height = self.sizes[index].tolist()
+        return self.valid[self._rows(index)].reshape(height, width)
+
+    def to(self, device: torch.device | str) -> ImageData:
+        """The images on another device; sizes and offsets too."""
+        return ImageData(
+            pixels=self.pixels.to(device),
+            sizes=self.sizes.to(device),
+            offsets=self.offsets.to(device),
+            valid=None if self.valid is None else self.valid.to(device),
+        )
+
+    def _rows(self, index: int) -> slice:
+        return slice(int(self.offsets[index]), int(self.offsets[index + 1]))
+
+    @classmethod
+    def empty(cls, sizes: Sequence[tuple[int, int]], *, masked: bool) -> ImageData:
+        """Room for pictures of these (width, height), to be filled by `put`; all is usable."""
+        if len(sizes) == 0:
+            raise NerfError("too_few_images", "There is no image.", "Send some images.")
+        sides = torch.tensor(list(sizes), dtype=torch.int64)
+        ends = sides.prod(dim=1).cumsum(0)
+        total = int(ends[-1])
+        return cls(
+            pixels=torch.from_numpy(np.empty((total, 3), np.uint8)),
+            sizes=sides,
+            offsets=torch.cat([torch.zeros(1, dtype=torch.int64), ends]),
+            valid=torch.from_numpy(np.ones(total, np.bool_)) if masked else None,
+        )
+
+    def put(
+        self, index: int, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Write one picture [H, W, 3] and its mask [H, W] (true = use) into its place."""
+        rows = self._rows(index)
+        self.pixels.numpy()[rows] = image.reshape(-1, 3)
+        if self.valid is not None and mask is not None:
+            self.valid.numpy()[rows] = mask.reshape(-1)
 
     @classmethod
     def from_arrays(
@@ -85,40 +152,57 @@ class ImageData:
         masks: Sequence[NDArray[np.bool_] | None] | None = None,
     ) -> ImageData:
         """From pictures [H, W, 3] uint8 and masks [H, W] bool (true = use) or None."""
-        if len(images) == 0:
-            raise NerfError("too_few_images", "There is no image.", "Send some images.")
-        sizes = torch.tensor([(image.shape[1], image.shape[0]) for image in images])
-        counts = torch.tensor([image.shape[0] * image.shape[1] for image in images])
-        offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
-        pixels = torch.empty((int(offsets[-1]), 3), dtype=torch.uint8)
-        valid = None
-        if masks is not None and any(mask is not None for mask in masks):
-            valid = torch.ones(len(pixels), dtype=torch.bool)
-        for index, image in enumerate(images):
-            rows = slice(int(offsets[index]), int(offsets[index + 1]))
-            pixels[rows] = torch.tensor(image).reshape(-1, 3)
-            mask = masks[index] if masks is not None else None
-            if valid is not None and mask is not None:
-                valid[rows] = torch.tensor(mask).reshape(-1)
-        return cls(pixels=pixels, sizes=sizes, offsets=offsets, valid=valid)
+        given = [None] * len(images) if masks is None else list(masks)
+        masked = any(mask is not None for mask in given)
+        data = cls.empty([(image.shape[1], image.shape[0]) for image in images], masked=masked)
+        for index, (image, mask) in enumerate(zip(images, given, strict=True)):
+            data.put(index, image, mask)
+        return data
+
+
+def image_sizes(paths: Sequence[Path], long_side: int) -> list[tuple[int, int]]:
+    """(width, height) that `load_images` would give, from the headers alone: nothing is decoded.
+
+    Raises NerfError `bad_image` naming the file.
+    """
+    sizes = []
+    for path in paths:
+        with _open(path) as opened:
+            sizes.append(reduced_size(opened.width, opened.height, long_side))
+    return sizes
 
 
 def load_images(
-    paths: Sequence[Path], long_side: int, masks: Sequence[Path | None] | None = None
+    paths: Sequence[Path],
+    long_side: int,
+    masks: Sequence[Path | None] | None = None,
+    *,
+    max_bytes: int | None = None,
 ) -> ImageData:
     """Read images, reduced by area averaging to at most `long_side` pixels.
 
     masks: one-channel pictures of the same shape, black = ignore, or None for an image.
-    Transparent pictures are laid on white. Raises NerfError `bad_image` naming the file.
+    Transparent pictures are laid on white. max_bytes: more than that is refused unread.
+    Memory: `memory_bytes` of the reduced sizes, and one decoded picture at a time.
+    Raises NerfError `bad_image` naming the file, `too_much_memory` naming what would fit.
     """
-    images: list[NDArray[np.uint8]] = []
-    kept: list[NDArray[np.bool_] | None] = []
-    for index, path in enumerate(paths):
-        images.append(_load_image(path, long_side))
-        mask = masks[index] if masks is not None else None
-        size = (images[-1].shape[1], images[-1].shape[0])
-        kept.append(None if mask is None else _load_mask(mask, size))
-    return ImageData.from_arrays(images, kept)
+    given = [None] * len(paths) if masks is None else list(masks)
+    masked = any(mask is not None for mask in given)
+    sizes = image_sizes(paths, long_side)
+    needed = memory_bytes(sizes, masked=masked)
+    if max_bytes is not None and needed > max_bytes:
+        fitting = int(long_side * math.sqrt(max_bytes / needed))
+        raise NerfError(
+            "too_much_memory",
+            f"{len(paths)} images of at most {long_side} pixels take {needed / 2**30:.1f} GiB, "
+            f"allowed are {max_bytes / 2**30:.1f}.",
+            f"Set train.data.long_side_px to {fitting}, or raise train.data.max_memory_gib.",
+        )
+    data = ImageData.empty(sizes, masked=masked)
+    for index, (path, mask) in enumerate(zip(paths, given, strict=True)):
+        usable = None if mask is None else _load_mask(mask, sizes[index])
+        data.put(index, _load_image(path, long_side), usable)
+    return data
 
 
 def _open(path: Path) -> Image.Image:
@@ -168,37 +252,95 @@ class PixelSampler:
     """Draws pixels uniformly over all usable pixels of some images.
 
     indices: the images drawn from; batches speak of positions in this list, not of image numbers.
+    device: where pixels are held and drawn. Elsewhere than on the CPU this takes the images' bytes
+        there once, and the generator given to `draw` must be of that device.
+    Raises NerfError `too_few_images` where masks leave nothing.
     """
 
-    def __init__(self, images: ImageData, indices: Sequence[int]) -> None:
-        self._images = images
+    def __init__(
+        self, images: ImageData, indices: Sequence[int], device: torch.device | str = "cpu"
+    ) -> None:
+        self.device = torch.device(device)
         rows = torch.tensor(list(indices), dtype=torch.int64)
-        self._starts = images.offsets[rows]
-        self._widths = images.sizes[rows, 0]
-        counts = images.offsets[rows + 1] - self._starts
-        self._ends = counts.cumsum(0)
-        self._firsts = self._ends - counts
-        self._usable: Tensor | None = None
-        if images.valid is not None:
-            parts = [
-                images.valid[int(start) : int(start + count)]
-                for start, count in zip(self._starts, counts, strict=True)
-            ]
-            self._usable = torch.cat(parts).nonzero().squeeze(-1)
-        self._total = int(self._ends[-1]) if self._usable is None else len(self._usable)
+        starts = images.offsets[rows]
+        counts = images.offsets[rows + 1] - starts
+        usable = None if images.valid is None else _UsablePixels.of(images.valid, starts, counts)
+        self._total = int(counts.sum()) if usable is None else usable.total
         if self._total == 0:
             raise NerfError(
                 "too_few_images", "The masks leave no pixel to train on.", "Check the masks."
             )
+        self._usable = None if usable is None else usable.to(self.device)
+        self._pixels = images.pixels.to(self.device)
+        self._starts = starts.to(self.device)
+        self._widths = images.sizes[rows, 0].to(self.device)
+        self._ends = counts.cumsum(0).to(self.device)
+        self._firsts = self._ends - counts.to(self.device)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """(positions [B] int64, pixel centres [B, 2] float32 x and y, colours [B, 3] in [0, 1])."""
-        drawn = torch.randint(self._total, (count,), generator=generator)
-        if self._usable is not None:
-            drawn = self._usable[drawn]
-        position = torch.searchsorted(self._ends, drawn, right=True)
-        within = drawn - self._firsts[position]
+        drawn = torch.randint(self._total, (count,), generator=generator, device=self.device)
+        if self._usable is None:
+            position = torch.searchsorted(self._ends, drawn, right=True)
+            within = drawn - self._firsts[position]
+        else:
+            position, row = self._usable.find(drawn)
+            within = row - self._starts[position]
         width = self._widths[position]
         x, y = within % width, torch.div(within, width, rounding_mode="floor")
-        colors = self._images.pixels[self._starts[position] + within].float() / 255.0
+        colors = self._pixels[self._starts[position] + within].float() / 255.0
         return position, torch.stack([x, y], dim=-1).float() + 0.5, colors
+
+
+@dataclass(frozen=True)
+class _UsablePixels:
+    """The k-th usable pixel of some images, without a list of them: counts of blocks of pixels.
+
+    valid: [P] bool. Of each of K blocks, [K] int64: `positions` of the block's image in the list,
+    `rows` its first row in `valid`, `lengths` its pixels, `ends` the usable pixels up to its end.
+    """
+
+    valid: Tensor
+    positions: Tensor
+    rows: Tensor
+    lengths: Tensor
+    ends: Tensor
+
+    @property
+    def total(self) -> int:
+        return int(self.ends[-1])
+
+    @classmethod
+    def of(cls, valid: Tensor, starts: Tensor, counts: Tensor) -> _UsablePixels:
+        """starts, counts: [N], first row and number of pixels of each image."""
+        positions, rows, lengths, usable = [], [], [], []
+        for position, (start, count) in enumerate(
+            zip(starts.tolist(), counts.tolist(), strict=True)
+        ):
+            first = torch.arange(start, start + count, BLOCK_PIXELS)
+            rows.append(first)
+            lengths.append((start + count - first).clamp_max(BLOCK_PIXELS))
+            positions.append(torch.full_like(first, position))
+            padding = len(first) * BLOCK_PIXELS - count
+            padded = torch.nn.functional.pad(valid[start : start + count], (0, padding))
+            usable.append(padded.reshape(-1, BLOCK_PIXELS).sum(dim=1))
+        ends = torch.cat(usable).cumsum(0)
+        return cls(valid, torch.cat(positions), torch.cat(rows), torch.cat(lengths), ends)
+
+    def to(self, device: torch.device) -> _UsablePixels:
+        moved = {name: value.to(device) for name, value in vars(self).items()}
+        return replace(self, **moved)
+
+    def find(self, ranks: Tensor) -> tuple[Tensor, Tensor]:
+        """(positions [B] in the list, rows [B] of `valid`) of the usable pixels with these ranks.
+
+        ranks: [B] int64 in [0, total), counted image after image, row by row.
+        """
+        block = torch.searchsorted(self.ends, ranks, right=True)
+        offset = torch.arange(BLOCK_PIXELS, device=ranks.device)
+        first, length = self.rows[block], self.lengths[block]
+        seen = self.valid[first[:, None] + torch.minimum(offset, length[:, None] - 1)]
+        seen &= offset < length[:, None]
+        left = self.ends[block] - ranks  # usable pixels of the block from this one on
+        rank = seen.sum(dim=1) - left
+        return self.positions[block], first + (seen.cumsum(dim=1) <= rank[:, None]).sum(dim=1)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from pipelines.nerf.config import HashGridConfig
+from pipelines.nerf.errors import NerfError
 
 HASH_PRIMES = (1, 2654435761, 805459861)
 NUM_SPHERICAL_HARMONICS = 16
@@ -62,7 +63,7 @@ def hash_encode(
 
     points: [..., 3] in [0, 1]; what lies outside is moved to the nearest face.
     table: [E, F]. resolutions [L], dense [L], offsets [L + 1]: as `level_layout`.
-    Returns [..., L * F], coarsest level first; differentiable in `points` and `table`.
+    Returns [..., L * F], coarsest level first; differentiable twice in `points` and `table`.
     Source: Instant-NGP, arXiv:2201.05989, section 3 and eq. 4.
     """
     lead = points.shape[:-1]
@@ -77,8 +78,8 @@ def hash_encode(
     indices, weights = [], []
     for corner in range(8):
         bits = (corner & 1, corner >> 1 & 1, corner >> 2 & 1)
-        vertex = cell + torch.tensor(bits, device=cell.device)
-        indices.append(_entry_index(vertex, resolutions, dense, offsets))
+        x, y, z = (part + bit for part, bit in zip(cell.unbind(-1), bits, strict=True))
+        indices.append(_entry_index(x, y, z, resolutions, dense, offsets))
         parts = [(high if bit else low)[..., axis] for axis, bit in enumerate(bits)]
         weights.append(parts[0] * parts[1] * parts[2])
     index = torch.stack(indices)  # [8, P, L]; one gather, so one scatter in the backward pass
@@ -87,9 +88,10 @@ def hash_encode(
     return features.reshape(*lead, num_levels * num_features)
 
 
-def _entry_index(vertex: Tensor, resolutions: Tensor, dense: Tensor, offsets: Tensor) -> Tensor:
-    """Rows of the table that hold the vertices [P, L, 3] (int64); returns [P, L]."""
-    x, y, z = vertex.unbind(-1)
+def _entry_index(
+    x: Tensor, y: Tensor, z: Tensor, resolutions: Tensor, dense: Tensor, offsets: Tensor
+) -> Tensor:
+    """Rows of the table that hold the vertices x, y, z, each [P, L] int64; returns [P, L]."""
     stride = resolutions + 1
     linear = x + stride * (y + stride * z)
     # T is a power of two, so the remainder in uint32 equals the low bits of the int64 product.
@@ -103,7 +105,10 @@ class HashGrid(nn.Module):
 
     table: [E, F] parameter, uniform in [-1e-3, 1e-3] at the start.
     engine: "plain" for the PyTorch definition; "fast" uses the compiled twin where there is one
-    for the table (float32 on the CPU) and the plain definition elsewhere.
+    for the table (float32 on the CPU) and the plain definition elsewhere. The twin has no second
+    derivatives: a loss on normals of the density in training needs "plain", and a backward pass
+    through the twin with `create_graph` raises NerfError `bad_config`. Normals for pictures and
+    exports take one derivative, which both engines have.
     """
 
     resolutions: Tensor
@@ -134,8 +139,33 @@ class HashGrid(nn.Module):
             # Imported here: a machine that only uses the plain definition never loads the compiler.
             from pipelines.nerf.kernels.hash_grid import hash_encode_fast
 
-            return hash_encode_fast(unit_points, self.table, *levels)
+            encoded = hash_encode_fast(unit_points, self.table, *levels)
+            if encoded.requires_grad:
+                encoded.register_hook(_refuse_second_derivatives)  # type: ignore[no-untyped-call]
+            return encoded
         return hash_encode(unit_points, self.table, *levels)
+
+
+def _refuse_second_derivatives(gradient: Tensor) -> None:
+    """A backward hook: to a second pass the compiled twin's gradients would be constants."""
+    # Inside a backward pass gradients are only recorded when it was asked to create a graph.
+    if torch.is_grad_enabled():
+        raise NerfError(
+            "bad_config",
+            "The compiled hash grid has no second derivatives, which were asked for on features "
+            f"{list(gradient.shape)}.",
+            "Train normals with the engine 'plain'.",
+        )
+
+
+class SphericalHarmonics(nn.Module):
+    """`spherical_harmonics` as a component: 16 values per direction, nothing trained."""
+
+    num_outputs = NUM_SPHERICAL_HARMONICS
+
+    def forward(self, directions: Tensor) -> Tensor:
+        """Unit vectors [..., 3] to [..., 16]."""
+        return spherical_harmonics(directions)
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:

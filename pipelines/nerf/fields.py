@@ -7,6 +7,7 @@ README.md; `kernels/` reads it. Wiring is left to `models`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -15,9 +16,46 @@ from torch import Tensor, nn
 
 from pipelines.nerf.config import NerfactoConfig, ProposalConfig
 from pipelines.nerf.contraction import unit_from_scene
-from pipelines.nerf.encodings import NUM_SPHERICAL_HARMONICS, HashGrid, spherical_harmonics
+from pipelines.nerf.encodings import HashGrid, SphericalHarmonics
+from pipelines.nerf.fourier import FourierFeatures
+from pipelines.nerf.plugins import plugin_components
+from pipelines.nerf.tensor_grids import CPEncoding, VMEncoding, VoxelGrid
 
 GRADIENT_CLAMP = 15.0
+POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 10, 4
+"""Waves of the Fourier encodings. Source: NeRF, arXiv:2003.08934, section 5.1."""
+
+Encoding = Any
+"""An `nn.Module` from points or directions [..., 3] to features [..., `num_outputs`]."""
+EncodingBuilder = Callable[[NerfactoConfig], Encoding]
+
+POSITION_ENCODINGS: dict[str, EncodingBuilder] = {
+    "hash": lambda config: HashGrid(config.grid),
+    "vm": lambda config: VMEncoding(
+        config.tensor_grid.resolution, config.tensor_grid.num_components
+    ),
+    "cp": lambda config: CPEncoding(
+        config.tensor_grid.resolution, config.tensor_grid.num_components
+    ),
+    "voxel": lambda config: VoxelGrid(
+        config.tensor_grid.resolution, config.tensor_grid.num_components
+    ),
+    "fourier": lambda config: FourierFeatures(
+        3, POSITION_FREQUENCIES, 0.0, POSITION_FREQUENCIES - 1.0, include_input=True
+    ),
+}
+DIRECTION_ENCODINGS: dict[str, EncodingBuilder] = {
+    "spherical_harmonics": lambda config: SphericalHarmonics(),
+    # Directions span [-1, 1] and waves are counted per unit interval: from half a wave on.
+    "fourier": lambda config: FourierFeatures(
+        3, DIRECTION_FREQUENCIES, -1.0, DIRECTION_FREQUENCIES - 2.0, include_input=True
+    ),
+}
+
+
+def _encoding(kind: str, built_in: dict[str, EncodingBuilder], config: NerfactoConfig) -> Encoding:
+    """The encoding that the option of this kind names, a plugin's too."""
+    return (built_in | plugin_components(kind))[getattr(config, kind)](config)
 
 
 class _TruncatedExp(torch.autograd.Function):
@@ -99,13 +137,22 @@ class NerfactoField(nn.Module):
         self.contraction = config.contraction
         self.average_init_density = config.average_init_density
         self.geo_feature_dim = config.geo_feature_dim
-        self.grid = HashGrid(config.grid)
-        self.density_mlp = MLP(self.grid.num_outputs, config.hidden_dim, 1 + config.geo_feature_dim)
-        inputs = NUM_SPHERICAL_HARMONICS + config.geo_feature_dim + config.appearance_dim
+        self.grid: Encoding = _encoding("position_encoding", POSITION_ENCODINGS, config)
+        features = self.grid.num_outputs
+        self.density_mlp = MLP(features, config.hidden_dim, 1 + config.geo_feature_dim)
+        self.direction_encoding: Encoding = _encoding(
+            "direction_encoding", DIRECTION_ENCODINGS, config
+        )
+        self.num_direction_features = self.direction_encoding.num_outputs
+        inputs = self.num_direction_features + config.geo_feature_dim + config.appearance_dim
         self.color_mlp = MLP(inputs, config.hidden_dim_color, config.hidden_dim_color, 3)
         self.appearance: nn.Embedding | None = None
         if config.appearance_dim:
             self.appearance = nn.Embedding(num_images, config.appearance_dim)
+
+    def unit(self, points: Tensor) -> Tensor:
+        """What the encoding sees of scene points [..., 3]: points [..., 3] in [0, 1]^3."""
+        return unit_from_scene(points, self.contraction)[0]
 
     def density(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Density [...] per scene unit and geometry features [..., G] at scene points [..., 3]."""
@@ -113,6 +160,11 @@ class NerfactoField(nn.Module):
         outputs = self.density_mlp(self.grid(unit))
         density = density_from_logits(outputs[..., 0], inside, self.average_init_density)
         return density, outputs[..., 1:]
+
+    def density_logits(self, points: Tensor) -> Tensor:
+        """The logarithm [...] of the density at scene points [..., 3], up to a constant."""
+        logits: Tensor = self.density_mlp(self.grid(self.unit(points)))[..., 0]
+        return logits
 
     def color(self, directions: Tensor, geometry: Tensor, codes: Tensor | None) -> Tensor:
         """Colour [R, S, 3] in [0, 1].
@@ -123,9 +175,10 @@ class NerfactoField(nn.Module):
         """
         first = self.color_mlp.layers[0]
         assert isinstance(first, nn.Linear)
-        start, stop = NUM_SPHERICAL_HARMONICS, NUM_SPHERICAL_HARMONICS + self.geo_feature_dim
+        start = self.num_direction_features
+        stop = start + self.geo_feature_dim
         per_ray = torch.nn.functional.linear(
-            spherical_harmonics(directions), first.weight[:, :start], first.bias
+            self.direction_encoding(directions), first.weight[:, :start], first.bias
         )
         if codes is not None:
             per_ray = per_ray + torch.nn.functional.linear(codes, first.weight[:, stop:])

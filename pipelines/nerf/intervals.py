@@ -7,8 +7,15 @@ come from is left to `samplers`, what the weights are used for to `rendering` an
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.plugins import plugin_components
 
 HISTOGRAM_PADDING = 0.01
 """Added to every weight before resampling, so that no interval is lost for good."""
@@ -29,10 +36,64 @@ def unspacing_piecewise(x: Tensor) -> Tensor:
     return torch.where(x < 0.5, 2.0 * x, 0.5 / (1.0 - x.clamp_min(0.5)))
 
 
-def t_from_s(s: Tensor, near: float, far: float) -> Tensor:
-    """Distances of normalised positions: s = 0 is `near`, s = 1 is `far`. Same shape."""
-    ends = spacing_piecewise(torch.tensor([near, far], dtype=torch.float64)).tolist()
-    return unspacing_piecewise(ends[0] + s * (ends[1] - ends[0]))
+def spacing_uniform(t: Tensor) -> Tensor:
+    """The identity: steps of one length. Source: NeRF, arXiv:2003.08934, eq. 2."""
+    return t
+
+
+def spacing_disparity(t: Tensor) -> Tensor:
+    """1 / t for t > 0, its own inverse: even steps seem even to a camera, as in forward scenes."""
+    return 1.0 / t
+
+
+class Spacing(NamedTuple):
+    """A monotone map of distances, even steps of which are taken, and its inverse."""
+
+    forward: Callable[[Tensor], Tensor]
+    inverse: Callable[[Tensor], Tensor]
+
+
+SPACINGS: dict[str, Spacing] = {
+    "piecewise": Spacing(spacing_piecewise, unspacing_piecewise),
+    "uniform": Spacing(spacing_uniform, spacing_uniform),
+    "disparity": Spacing(spacing_disparity, spacing_disparity),
+}
+"""By the name that options use."""
+
+
+def t_from_s(s: Tensor, near: float, far: float, spacing: str = "piecewise") -> Tensor:
+    """Distances of normalised positions: s = 0 is `near`, s = 1 is `far`. Same shape.
+
+    near, far: scene units. spacing: one of `SPACINGS` or a plugin's. Raises NerfError `bad_config`
+    unless 0 <= near < far < infinity, with near > 0 for `disparity`.
+    """
+    forward, inverse = _checked_spacing(spacing, near, far)
+    first, last = forward(torch.tensor([near, far], dtype=torch.float64)).tolist()
+    if spacing == "disparity":
+        # first + s (last - first) would lose 1 / far beside 1 / near in float32.
+        return inverse((1.0 - s) * first + s * last)
+    return inverse(first + s * (last - first))
+
+
+def _checked_spacing(spacing: str, near: float, far: float) -> Spacing:
+    known: dict[str, Spacing] = SPACINGS
+    if spacing not in known:
+        known = SPACINGS | plugin_components("spacing")
+    if spacing not in known:
+        raise NerfError(
+            "bad_config",
+            f"There is no spacing {spacing!r}; allowed: {', '.join(known)}.",
+            "Choose one of them.",
+        )
+    if not 0.0 <= near < far < math.inf or (spacing == "disparity" and near == 0.0):
+        lowest = "0 < near" if spacing == "disparity" else "0 <= near"
+        raise NerfError(
+            "bad_config",
+            f"Samples cannot lie from {near} to {far} with spacing {spacing!r}; "
+            f"allowed: {lowest} < far < infinity.",
+            "Change near and far, in scene units.",
+        )
+    return known[spacing]
 
 
 def bin_midpoints(edges: Tensor) -> Tensor:

@@ -3,45 +3,72 @@
 Symbols: plane point (x, y) = (pixel - principal) / focal as the lens shows it; direction (X, Y, Z)
 in OpenCV's axes (+X right, +Y down, +Z forward); terms k1, k2, k3, k4, p1, p2; r the distance from
 the axis on the plane; theta the angle from the axis. All functions are differentiable and work on
-a mixed batch: `fisheye` [R] bool says per row which formula holds.
+a mixed batch: `model` [R] int64 says per row which formula holds, and `kinds` which of them occur
+at all, so that no device has to be asked.
+
+    PINHOLE          (x, y) = (X, Y) / Z
+    OPENCV           the same, then shifted along and across the radius by the terms
+    OPENCV_FISHEYE   (x, y) = theta (1 + k1 theta^2 + ... + k4 theta^8) (X, Y) / |(X, Y)|
+    EQUIRECTANGULAR  (x, y) = (longitude, -latitude) / pi, where longitude = atan2(X, Z) is 0 on the
+                     axis and grows to the right, latitude = asin(-Y / |(X, Y, Z)|) grows upwards.
+                     A whole panorama has focal (width / 2, height) and its principal point in the
+                     middle: the outermost columns look backwards, the top row straight up.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import torch
 from torch import Tensor
+
+PINHOLE, OPENCV, FISHEYE, EQUIRECTANGULAR = range(4)
+CAMERA_MODELS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR")
+"""Names of the models; the position is the number in `model`."""
 
 NEWTON_STEPS = 10
 MIN_DETERMINANT = 1e-4
 
 
-def distort(directions: Tensor, terms: Tensor, fisheye: Tensor) -> Tensor:
+def distort(
+    directions: Tensor, terms: Tensor, model: Tensor, kinds: Collection[int] = range(4)
+) -> Tensor:
     """Where the lens shows directions [R, 3] on the plane: [R, 2].
 
-    terms: [R, 6]. fisheye: [R] bool. Source: OpenCV, calib3d and fisheye module documentation.
+    terms: [R, 6]. model: [R] int64. kinds: the numbers that `model` may hold.
+    Source: OpenCV, calib3d and fisheye module documentation; nerfstudio's data conventions.
     """
     depth = directions[:, 2:]
     # A point in the camera's own plane has no image; the guard only keeps it finite.
     safe = torch.where(depth.abs() < 1e-9, torch.full_like(depth, 1e-9), depth)
-    shown = _shift(directions[:, :2] / safe, terms)[0]
-    if bool(fisheye.any()):
-        radius = directions[:, :2].norm(dim=-1)
-        theta = torch.atan2(radius, directions[:, 2])
-        scale = _bent_angle(theta, terms)[0] / radius.clamp_min(1e-9)
-        shown = torch.where(fisheye[:, None], directions[:, :2] * scale[:, None], shown)
+    shown = directions[:, :2] / safe
+    if OPENCV in kinds:
+        shown = _shift(shown, terms)[0]
+    if FISHEYE in kinds:
+        shown = torch.where((model == FISHEYE)[:, None], _distort_fisheye(directions, terms), shown)
+    if EQUIRECTANGULAR in kinds:
+        panorama = (model == EQUIRECTANGULAR)[:, None]
+        shown = torch.where(panorama, _distort_equirectangular(directions), shown)
     return shown
 
 
-def undistort(plane: Tensor, terms: Tensor, fisheye: Tensor) -> Tensor:
+def undistort(
+    plane: Tensor, terms: Tensor, model: Tensor, kinds: Collection[int] = range(4)
+) -> Tensor:
     """Directions [R, 3], not normalised, that the lens shows at plane points [R, 2].
 
-    terms: [R, 6]. fisheye: [R] bool. Newton's method; a step is left out where the lens formula
-    folds over, so that a pixel beyond its valid range gets a finite direction.
+    terms: [R, 6]. model: [R] int64. kinds: the numbers that `model` may hold. Newton's method; a
+    step is left out where the lens formula folds over, so that a pixel beyond its valid range gets
+    a finite direction.
     """
-    ideal = _undistort_plane(plane, terms)
+    ideal = _undistort_plane(plane, terms) if OPENCV in kinds else plane
     direction = torch.cat([ideal, torch.ones_like(ideal[:, :1])], dim=-1)
-    if bool(fisheye.any()):
-        direction = torch.where(fisheye[:, None], _undistort_fisheye(plane, terms), direction)
+    if FISHEYE in kinds:
+        fisheye = (model == FISHEYE)[:, None]
+        direction = torch.where(fisheye, _undistort_fisheye(plane, terms), direction)
+    if EQUIRECTANGULAR in kinds:
+        panorama = (model == EQUIRECTANGULAR)[:, None]
+        direction = torch.where(panorama, _undistort_equirectangular(plane), direction)
     return direction
 
 
@@ -83,6 +110,13 @@ def _bent_angle(theta: Tensor, terms: Tensor) -> tuple[Tensor, Tensor]:
     return bent, slope
 
 
+def _distort_fisheye(directions: Tensor, terms: Tensor) -> Tensor:
+    radius: Tensor = directions[:, :2].norm(dim=-1)
+    theta = torch.atan2(radius, directions[:, 2])
+    scale = _bent_angle(theta, terms)[0] / radius.clamp_min(1e-9)
+    return directions[:, :2] * scale[:, None]
+
+
 def _undistort_fisheye(plane: Tensor, terms: Tensor) -> Tensor:
     bent_wanted = plane.norm(dim=-1)
     theta = bent_wanted.clamp_max(torch.pi)
@@ -92,3 +126,16 @@ def _undistort_fisheye(plane: Tensor, terms: Tensor) -> Tensor:
         theta = (theta - step).clamp(0.0, torch.pi)
     across = plane * (torch.sin(theta) / bent_wanted.clamp_min(1e-9))[:, None]
     return torch.cat([across, torch.cos(theta)[:, None]], dim=-1)
+
+
+def _distort_equirectangular(directions: Tensor) -> Tensor:
+    x, y, z = directions.unbind(-1)
+    longitude, down = torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())
+    return torch.stack([longitude, down], dim=-1) / torch.pi
+
+
+def _undistort_equirectangular(plane: Tensor) -> Tensor:
+    longitude, down = (plane * torch.pi).unbind(-1)
+    level = torch.cos(down)
+    across, forward = torch.sin(longitude) * level, torch.cos(longitude) * level
+    return torch.stack([across, torch.sin(down), forward], dim=-1)

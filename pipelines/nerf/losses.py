@@ -1,7 +1,7 @@
 """What training minimises.
 
 Symbols: R rays; final histogram (s, w) with S intervals; a proposal's histogram (s^, w^) with S^
-intervals; both in s-space, [0, 1].
+intervals; both in s-space, [0, 1]. d the direction of a ray, from the camera into the scene.
 """
 
 from __future__ import annotations
@@ -74,3 +74,30 @@ def distortion_loss(s_edges: Tensor, weights: Tensor) -> Tensor:
     between = 2.0 * (moments * weight_before - weights * moment_before).sum(dim=-1)
     within = (weights.square() * (s_edges[..., 1:] - s_edges[..., :-1])).sum(dim=-1) / 3.0
     return (between + within).mean()
+
+
+def orientation_loss(weights: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
+    """Penalty on visible normals that face away from the camera; a scalar.
+
+    Mean over rays of sum_i w_i min(0, n_i . (-d))^2, which is w_i max(0, n_i . d)^2.
+    weights: [R, S], taken as constants: density is not to vanish where its normal is wrong.
+    normals: [R, S, 3], unit, scene axes; what the loss trains. Normals of the density need
+        `create_graph` for that: the reference implementation leaves it out, so that there the loss
+        is computed but moves nothing.
+    directions: [R, 3], unit, scene axes.
+    Source: Ref-NeRF, arXiv:2112.03907, eq. 11.
+    """
+    facing = (normals * -directions[..., None, :]).sum(dim=-1)
+    return (weights.detach() * facing.clamp_max(0.0).square()).sum(dim=-1).mean()
+
+
+def predicted_normal_loss(weights: Tensor, normals: Tensor, predicted: Tensor) -> Tensor:
+    """How far predicted normals are from those of the density; trains the prediction alone.
+
+    Mean over rays of sum_i w_i (1 - n_i . n^_i), half of Ref-NeRF's w_i |n_i - n^_i|^2 where both
+    have length one. weights: [R, S] and normals: [R, S, 3], unit, both taken as constants;
+    predicted: [R, S, 3], unit. Ref-NeRF lets the density learn from it as well.
+    Source: Ref-NeRF, arXiv:2112.03907, eq. 10; Nerfacto, arXiv:2302.04264, section 5.
+    """
+    agreement = (normals.detach() * predicted).sum(dim=-1)
+    return (weights.detach() * (1.0 - agreement)).sum(dim=-1).mean()

@@ -1,14 +1,15 @@
 """A trained model and a camera -> pictures, in tiles of bounded memory.
 
-On the CPU the whole forward pass runs in a compiled kernel (`kernels.render_rays`); elsewhere, or
-with engine "plain", the model itself is asked in chunks. Depths are distances along the ray in
-world units, not z. Symbols: R rays, H and W of a picture.
+On the CPU the whole forward pass runs in a compiled kernel (`kernels.render_rays`) where that knows
+the model; elsewhere, or with engine "plain", the model itself is asked in chunks. Depths are
+distances along the ray in world units, not z. Symbols: R rays, H and W of a picture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.models.base import Appearance, Model
 from pipelines.nerf.rays import Rays
 
 FloatArray = NDArray[np.float32]
@@ -28,6 +29,14 @@ FAST_TILE_RAYS = 8192
 PLAIN_BYTES = {"cpu": 256 * 2**20, "cuda": 2 * 2**30}
 """Memory that the intermediate tensors of one plain chunk may take, by kind of device."""
 MAX_PLAIN_RAYS = 32768
+_CHANNELS: dict[str, tuple[int, ...]] = {
+    "rgb": (3,),
+    "accumulation": (),
+    "depth": (),
+    "expected_depth": (),
+    "normals": (3,),
+    "predicted_normals": (3,),
+}
 
 
 @dataclass(frozen=True)
@@ -36,12 +45,15 @@ class RenderedImage:
 
     rgb: [H, W, 3], sRGB in [0, 1]. accumulation: [H, W] in [0, 1], the chance that the ray ends.
     depth, expected_depth: [H, W], median and mean distance along the ray, world units.
+    normals, predicted_normals: [H, W, 3], world axes, unit or zero, from a model that learned them.
     """
 
     rgb: FloatArray
     accumulation: FloatArray
     depth: FloatArray
     expected_depth: FloatArray
+    normals: FloatArray | None = None
+    predicted_normals: FloatArray | None = None
 
 
 class Renderer:
@@ -49,21 +61,23 @@ class Renderer:
 
     model: is moved to `device` where one is given. scene: gives the world's unit.
     engine: "fast" is the compiled kernel, on the CPU only; "plain" the model in PyTorch; "auto" is
-        fast on the CPU and plain elsewhere.
+        fast on the CPU where the kernel knows the model, and plain elsewhere.
     early_stop, weight_threshold: what the fast engine may leave out, see `kernels.render_rays`;
         with both at 0 it agrees with the plain one to rounding.
-    Raises NerfError `bad_config` for an unknown engine, or for "fast" away from the CPU.
+    normals: also render normals, which needs a model that learned them and the plain engine.
+    Raises NerfError `bad_config` for an unknown engine, or for "fast" where it cannot be.
     """
 
     def __init__(
         self,
-        model: Nerfacto,
+        model: Model,
         scene: SceneTransform,
         *,
         engine: str = "auto",
         device: torch.device | str | None = None,
         early_stop: float = 1e-3,
         weight_threshold: float = 1e-3,
+        normals: bool = False,
     ) -> None:
         self._model = model if device is None else model.to(device)
         self._scene = scene
@@ -74,21 +88,27 @@ class Renderer:
             raise NerfError(
                 "bad_config", f"There is no engine {engine}.", "Use auto, plain or fast."
             )
-        on_cpu = self._device.type == "cpu"
-        if engine == "fast" and not on_cpu:
+        is_fast = (
+            engine != "plain"
+            and self._device.type == "cpu"
+            and not normals
+            and _kernel_knows(model)
+        )
+        if engine == "fast" and not is_fast:
             raise NerfError(
                 "bad_config",
-                f"The fast renderer runs on the CPU, and the model is on {self._device}.",
-                "Use engine auto, or move the model to the CPU.",
+                "The fast renderer knows Nerfacto with a hash grid, on the CPU, without normals; "
+                f"this is {type(model).__name__} on {self._device}.",
+                "Use engine auto.",
             )
-        self.engine = ("fast" if on_cpu else "plain") if engine == "auto" else engine
+        self.engine = "fast" if is_fast else "plain"
 
     def render(
         self,
         cameras: Cameras,
         index: int,
         *,
-        appearance: int | None = None,
+        appearance: Appearance = None,
         progress: Progress | None = None,
     ) -> RenderedImage:
         """The picture of camera `index`, at the size and with the lens that the camera has.
@@ -107,19 +127,19 @@ class Renderer:
             )
 
         flat = self._render(rays_of, width * height, appearance, progress)
-        return RenderedImage(
-            rgb=flat.rgb.reshape(height, width, 3),
-            accumulation=flat.accumulation.reshape(height, width),
-            depth=flat.depth.reshape(height, width),
-            expected_depth=flat.expected_depth.reshape(height, width),
-        )
+        shaped = {
+            item.name: getattr(flat, item.name).reshape(height, width, *_CHANNELS[item.name])
+            for item in fields(flat)
+            if getattr(flat, item.name) is not None
+        }
+        return RenderedImage(**shaped)
 
     def render_rays(
         self,
         origins: Tensor | FloatArray,
         directions: Tensor | FloatArray,
         *,
-        appearance: int | None = None,
+        appearance: Appearance = None,
         progress: Progress | None = None,
     ) -> RenderedImage:
         """What single rays see, with [R] for [H, W] in the result.
@@ -139,11 +159,11 @@ class Renderer:
         self,
         rays_of: Callable[[int, int], Rays],
         num_rays: int,
-        appearance: int | None,
+        appearance: Appearance,
         progress: Progress | None,
     ) -> RenderedImage:
         """`rays_of(begin, end)` makes the rays of one tile."""
-        result = np.zeros((num_rays, 6), np.float32)
+        result: dict[str, FloatArray] = {}
         tile, draw = self._drawer(appearance)
         was_training = self._model.training
         self._model.eval()
@@ -151,31 +171,32 @@ class Renderer:
             with torch.no_grad():
                 for begin in range(0, num_rays, tile):
                     end = min(begin + tile, num_rays)
-                    rgb, *others = draw(rays_of(begin, end))
-                    result[begin:end, :3] = rgb
-                    result[begin:end, 3:] = np.stack(others, axis=-1)
+                    for name, values in draw(rays_of(begin, end)).items():
+                        if name not in result:
+                            result[name] = np.zeros((num_rays, *_CHANNELS[name]), np.float32)
+                        result[name][begin:end] = values
                     if progress is not None:
                         progress(end / num_rays)
         finally:
             self._model.train(was_training)
         to_world = np.float32(1.0 / self._scene.scale)
-        return RenderedImage(
-            rgb=result[:, :3].clip(0.0, 1.0),
-            accumulation=result[:, 3].clip(0.0, 1.0),
-            depth=result[:, 4] * to_world,
-            expected_depth=result[:, 5] * to_world,
-        )
+        for name in ("depth", "expected_depth"):
+            result[name] *= to_world
+        for name in ("rgb", "accumulation"):
+            result[name].clip(0.0, 1.0, out=result[name])
+        return RenderedImage(**result)
 
     def _drawer(
-        self, appearance: int | None
-    ) -> tuple[int, Callable[[Rays], tuple[FloatArray, ...]]]:
-        """(rays per tile, a function from rays to rgb, accumulation, median, expected depth)."""
+        self, appearance: Appearance
+    ) -> tuple[int, Callable[[Rays], dict[str, FloatArray]]]:
+        """(rays per tile, a function from rays to the fields of `RenderedImage`, scene units)."""
         if self.engine == "plain":
 
-            def draw_plain(rays: Rays) -> tuple[FloatArray, ...]:
-                seen = self._model(rays, appearance=appearance)
-                names = ("rgb", "accumulation", "depth", "expected_depth")
-                return tuple(seen[name].float().cpu().numpy() for name in names)
+            def draw_plain(rays: Rays) -> dict[str, FloatArray]:
+                seen: dict[str, Any] = self._model(rays, appearance=appearance)
+                return {
+                    name: seen[name].float().cpu().numpy() for name in _CHANNELS if name in seen
+                }
 
             return self._plain_tile(), draw_plain
 
@@ -189,22 +210,20 @@ class Renderer:
             weight_threshold=self._weight_threshold,
         )
 
-        def draw_fast(rays: Rays) -> tuple[FloatArray, ...]:
-            return render_rays(packed, rays.origins.numpy(), rays.directions.numpy())
+        def draw_fast(rays: Rays) -> dict[str, FloatArray]:
+            found = render_rays(packed, rays.origins.numpy(), rays.directions.numpy())
+            return dict(zip(_CHANNELS, found, strict=False))
 
         return FAST_TILE_RAYS, draw_fast
 
     def _plain_tile(self) -> int:
         """Rays whose intermediate tensors fit the memory that a plain chunk may take."""
-        config = self._model.config
-        proposals = config.proposals[: len(self._model.proposals)]
-        rounds = range(len(config.num_proposal_samples))
-        grids = [proposals[min(i, len(proposals) - 1)].grid for i in rounds] + [config.grid]
-        samples = [*config.num_proposal_samples, config.num_nerf_samples]
-        # Per sample, level and corner: an index (8 bytes), a weight (4), features (4 F), twice.
-        per_ray = max(
-            count * grid.num_levels * 8 * 2 * (12 + 4 * grid.features_per_level)
-            for count, grid in zip(samples, grids, strict=True)
-        )
         budget = PLAIN_BYTES.get(self._device.type, PLAIN_BYTES["cpu"])
-        return max(1, min(MAX_PLAIN_RAYS, budget // per_ray))
+        return max(1, min(MAX_PLAIN_RAYS, budget // self._model.bytes_per_ray()))
+
+
+def _kernel_knows(model: Model) -> bool:
+    # Imported here: a machine that only renders on a GPU never loads the compiler.
+    from pipelines.nerf.kernels.render_rays import supports
+
+    return supports(model)

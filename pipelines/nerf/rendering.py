@@ -9,8 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pipelines.nerf.errors import NerfError
 from pipelines.nerf.intervals import bin_midpoints
+from pipelines.nerf.normals import unit_vectors
 
+BACKGROUNDS = ("last_sample", "black", "white", "random")
 MEDIAN = 0.5
 
 
@@ -31,8 +34,15 @@ def composite(
     colors: [R, S, 3] in [0, 1]. weights: [R, S].
     background: "last_sample" (colour of the last sample), "black", "white", or "random": uniform
         numbers from the generator in training, black without one.
-    Returns [R, 3]. Source: NeRF, arXiv:2003.08934, eq. 3.
+    Returns [R, 3] in [0, 1]. Raises NerfError `bad_config` for another name.
+    Source: NeRF, arXiv:2003.08934, eq. 3.
     """
+    if background not in BACKGROUNDS:
+        raise NerfError(
+            "bad_config",
+            f"There is no background '{background}'.",
+            f"Choose one of {', '.join(BACKGROUNDS)}.",
+        )
     rgb = (weights[..., None] * colors).sum(dim=-2)
     missing = 1.0 - accumulation(weights)[..., None]
     if background == "last_sample":
@@ -65,5 +75,8 @@ def expected_depth(weights: Tensor, t_edges: Tensor) -> Tensor:
 
 
 def composite_normals(normals: Tensor, weights: Tensor) -> Tensor:
-    """normalize(sum_i w_i n_i). normals: [R, S, 3], unit; weights: [R, S]. Returns [R, 3]."""
-    return torch.nn.functional.normalize((weights[..., None] * normals).sum(dim=-2), dim=-1)
+    """The direction of sum_i w_i n_i, with length one; 0 for a ray that meets nothing.
+
+    normals: [R, S, 3], unit, any axes. weights: [R, S]. Returns [R, 3] in the same axes.
+    """
+    return unit_vectors((weights[..., None] * normals).sum(dim=-2))

@@ -1,4 +1,4 @@
-"""Where along the rays the networks are asked: piece-wise first, then where proposals see mass.
+"""Where along the rays the networks are asked: evenly spaced first, then where mass was seen.
 
 Symbols: R rays, S samples. Random numbers come from a `torch.Generator` in training; without one
 the samples are the middle ones, as in rendering.
@@ -11,7 +11,14 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from pipelines.nerf.intervals import bin_midpoints, sample_pdf, t_from_s, weights_from_density
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.intervals import (
+    HISTOGRAM_PADDING,
+    bin_midpoints,
+    sample_pdf,
+    t_from_s,
+    weights_from_density,
+)
 from pipelines.nerf.rays import Rays, RaySamples
 
 DensityFunction = Callable[[Tensor], Tensor]
@@ -28,20 +35,22 @@ def uniform_jitter(
     return torch.rand(shape, generator=generator, device=like.device, dtype=like.dtype)
 
 
-def sample_piecewise(
+def sample_along(
     rays: Rays,
     num_samples: int,
     near: float,
     far: float,
     *,
+    spacing: str = "piecewise",
     single_jitter: bool = True,
     generator: torch.Generator | None = None,
 ) -> RaySamples:
-    """Intervals even in `s`: half of them within distance 1.
+    """Intervals even in `s`, in the sense of a spacing function.
 
-    near, far: scene units. With a generator each edge moves between the midpoints beside it, by
-    one number per ray (`single_jitter`) or one per edge.
-    Source: Nerfacto, arXiv:2302.04264, section 5.
+    near, far: scene units. spacing: one of `intervals.SPACINGS`; `piecewise` puts half of the
+    intervals within distance 1. With a generator each edge moves between the midpoints beside it,
+    by one number per ray (`single_jitter`) or one per edge.
+    Source: Nerfacto, arXiv:2302.04264, section 5; NeRF, arXiv:2003.08934, eq. 2.
     """
     edges = torch.linspace(
         0.0, 1.0, num_samples + 1, dtype=rays.origins.dtype, device=rays.origins.device
@@ -52,7 +61,7 @@ def sample_piecewise(
         upper = torch.cat([middles, edges[:, -1:]], dim=-1)
         lower = torch.cat([edges[:, :1], middles], dim=-1)
         edges = torch.lerp(lower, upper, jitter.expand_as(edges))
-    return RaySamples(s_edges=edges, t_edges=t_from_s(edges, near, far))
+    return RaySamples(s_edges=edges, t_edges=t_from_s(edges, near, far, spacing))
 
 
 def anneal_exponent(step: int, anneal_steps: int, slope: float) -> float:
@@ -75,24 +84,36 @@ def sample_proposals(
     near: float,
     far: float,
     *,
+    spacing: str = "piecewise",
     exponent: float = 1.0,
     single_jitter: bool = True,
     generator: torch.Generator | None = None,
 ) -> tuple[RaySamples, list[RaySamples], list[Tensor]]:
     """Rounds of proposals, each drawing the next round's samples where it found mass.
 
-    densities: one function per round. exponent: see `anneal_exponent`.
+    densities: one function per round, at least one; the same one may serve several rounds.
+    num_proposal_samples: intervals of each round. near, far, spacing: see `sample_along`.
+    exponent: see `anneal_exponent`.
     Returns (final samples, samples of each round, weights [R, S] of each round). Positions carry no
     gradient to the rays: cameras are moved by the colour loss alone, and half of the proposals'
     backward pass is spared. Weights carry one to the networks unless under `torch.no_grad()`.
-    Source: Mip-NeRF 360, arXiv:2111.12077, section 3.
+    Source: Mip-NeRF 360, arXiv:2111.12077, section 3. Raises NerfError `bad_config` where the
+    numbers of functions and of rounds differ.
     """
+    if not 1 <= len(densities) == len(num_proposal_samples):
+        raise NerfError(
+            "bad_config",
+            f"There are {len(densities)} proposal densities and sample counts for "
+            f"{len(num_proposal_samples)} rounds; allowed: one of each per round, at least one.",
+            "Give a density function and a sample count for every round.",
+        )
     fixed = rays.detach()
-    samples = sample_piecewise(
+    samples = sample_along(
         fixed,
         num_proposal_samples[0],
         near,
         far,
+        spacing=spacing,
         single_jitter=single_jitter,
         generator=generator,
     )
@@ -107,5 +128,35 @@ def sample_proposals(
         # At exponent 0 even a weight of 0 counts as 1, as torch.pow has it: a flat histogram.
         shape = found.detach() if exponent == 1.0 else found.detach().pow(exponent)
         edges = sample_pdf(samples.s_edges, shape, num_next, jitter=jitter)
-        samples = RaySamples(s_edges=edges, t_edges=t_from_s(edges, near, far))
+        samples = RaySamples(s_edges=edges, t_edges=t_from_s(edges, near, far, spacing))
     return samples, rounds, weights
+
+
+def sample_fine(
+    rays: Rays,
+    coarse: RaySamples,
+    weights: Tensor,
+    num_samples: int,
+    near: float,
+    far: float,
+    *,
+    include_coarse: bool = True,
+    padding: float = HISTOGRAM_PADDING,
+    spacing: str = "piecewise",
+    single_jitter: bool = True,
+    generator: torch.Generator | None = None,
+) -> RaySamples:
+    """NeRF's second round: more samples where the first one found mass.
+
+    coarse: S intervals, made with the same near, far and spacing. weights: [R, S], theirs.
+    num_samples: N > 0. include_coarse: keep the coarse edges and cut them further by N new ones,
+    which gives S + N intervals; otherwise N intervals between new edges alone.
+    Returns samples with increasing edges that carry no gradient.
+    Source: NeRF, arXiv:2003.08934, section 5.2 (there with padding 1e-5).
+    """
+    num_edges = num_samples if include_coarse else num_samples + 1
+    jitter = uniform_jitter(len(rays), num_edges, single_jitter, generator, weights)
+    edges = sample_pdf(coarse.s_edges, weights, num_edges - 1, jitter=jitter, padding=padding)
+    if include_coarse:
+        edges = torch.cat([coarse.s_edges.detach(), edges], dim=-1).sort(dim=-1).values
+    return RaySamples(s_edges=edges, t_edges=t_from_s(edges, near, far, spacing))

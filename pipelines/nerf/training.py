@@ -21,11 +21,11 @@ from torch import Tensor
 
 from pipelines.nerf.cameras import Cameras
 from pipelines.nerf.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.nerf.config import OptimizerConfig, TrainConfig, validate
+from pipelines.nerf.config import OptimizerConfig, TrainConfig, find_method, validate
 from pipelines.nerf.data import ImageData, PixelSampler
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.metrics import psnr_from_mse
-from pipelines.nerf.models.nerfacto import Nerfacto, proposals_due
+from pipelines.nerf.models.base import Model
 
 TIMED_STEPS = 50
 STEPS_PER_CUDA_REPORT = 20
@@ -74,13 +74,12 @@ def choose_device(wanted: str) -> torch.device:
 class _State:
     """All that changes from step to step."""
 
-    model: Nerfacto
+    model: Model
     optimizers: dict[str, torch.optim.Adam]
     scaler: torch.amp.GradScaler
     pixel_random: torch.Generator
     model_random: torch.Generator
     step: int = 0
-    steps_since_update: int = 0
     elapsed_s: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
@@ -91,7 +90,7 @@ class _State:
             "pixel_random": self.pixel_random.get_state(),
             "model_random": self.model_random.get_state(),
             "step": self.step,
-            "steps_since_update": self.steps_since_update,
+            "schedule": self.model.schedule_state(),
             "elapsed_s": self.elapsed_s,
         }
 
@@ -105,7 +104,7 @@ class _State:
         if saved["model_random"].shape == self.model_random.get_state().shape:
             self.model_random.set_state(saved["model_random"])  # else: another kind of device
         self.step = int(saved["step"])
-        self.steps_since_update = int(saved["steps_since_update"])
+        self.model.load_schedule_state(saved["schedule"])
         self.elapsed_s = float(saved["elapsed_s"])
 
 
@@ -118,9 +117,9 @@ def train(
     seed: int,
     checkpoint_path: Path | None = None,
     on_progress: Callable[[TrainProgress], None] = lambda progress: None,
-    on_preview: Callable[[int, Nerfacto], None] = lambda step, model: None,
+    on_preview: Callable[[int, Model], None] = lambda step, model: None,
     on_checkpoint: Callable[[], None] = lambda: None,
-) -> Nerfacto:
+) -> Model:
     """Fit a model; returned in `eval()` on the device it was trained on.
 
     images, cameras: all N, of the same sizes (`Cameras.resized`). train_indices: those learned
@@ -154,7 +153,12 @@ def train(
     while state.step < config.max_steps and not _time_is_up(state.elapsed_s, config):
         started = time.monotonic()
         is_reported = device.type == "cpu" or state.step % STEPS_PER_CUDA_REPORT == 0
-        losses = _optimise_once(state, sampler, posed, config, check=is_reported)
+        try:
+            losses = _optimise_once(state, sampler, posed, config, check=is_reported)
+        except NonFiniteLoss:
+            if _is_finite(model):
+                save()
+            raise
         step_times.append(time.monotonic() - started)
         state.elapsed_s += step_times[-1]
         if is_reported:
@@ -177,19 +181,18 @@ def _optimise_once(
 
     check: read the losses, which waits for the GPU. Returns them by name, or {} unread.
     """
-    model, step = state.model, state.step
+    model = state.model
     device = cameras.focal.device
-    _set_learning_rates(state.optimizers, config.optimizer, step)
-    state.steps_since_update += 1
-    update = proposals_due(step, state.steps_since_update, config.model)
+    _set_learning_rates(state.optimizers, config.optimizer, state.step)
+    plan = model.plan_step(state.step, state.model_random)
 
     drawn = sampler.draw(config.rays_per_step, state.pixel_random)
     index, pixels, colors = (item.to(device) for item in drawn)
     rays = cameras.generate_rays(index, pixels)
     with torch.autocast(device.type, dtype=torch.float16, enabled=device.type == "cuda"):
-        outputs = model(rays, step=step, update_proposals=update, generator=state.model_random)
-        losses = model.loss_dict(outputs, colors, update_proposals=update)
-    values = _checked_values(losses, step) if check else {}
+        outputs = model(rays, plan=plan, generator=state.model_random)
+        losses = model.loss_dict(outputs, colors, plan=plan)
+    values = _checked_values(losses, state.step) if check else {}
 
     for parameter in model.parameters():
         parameter.grad = None  # Adam leaves alone what has no gradient: proposals between updates
@@ -200,8 +203,7 @@ def _optimise_once(
     state.scaler.update()
 
     state.step += 1
-    if update:
-        state.steps_since_update = 0
+    model.finish_step(plan)
     return values
 
 
@@ -219,11 +221,11 @@ def _resume(state: _State, path: Path, fingerprint: str) -> None:
 def _initial_state(config: TrainConfig, num_images: int, seed: int, device: torch.device) -> _State:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = Nerfacto(config.model, num_images).to(device)
+        model: Model = find_method(config.method).build(config.model, num_images).to(device)
     on_gpu = device.type == "cuda"
     fast = config.engine == "fast" or (config.engine == "auto" and not on_gpu)
     model.set_engine("fast" if fast else "plain")
-    networks = [*model.field.parameters(), *model.proposals.parameters()]
+    networks = list(model.network_parameters())
     rates = config.optimizer
     optimizers = {"networks": torch.optim.Adam(networks, lr=rates.lr, eps=rates.eps, fused=True)}
     if config.model.camera_mode != "off":
@@ -253,16 +255,26 @@ def _set_learning_rates(
             group["lr"] = wanted[name]
 
 
+class NonFiniteLoss(NerfError):
+    """A loss is NaN or infinite; nothing was learned from that step."""
+
+
 def _checked_values(losses: dict[str, Tensor], step: int) -> dict[str, float]:
     values = {name: float(loss.detach()) for name, loss in losses.items()}
     for name, value in values.items():
         if not math.isfinite(value):
-            raise NerfError(
+            raise NonFiniteLoss(
                 "non_finite_loss",
                 f"The {name} loss became {value} at step {step}.",
-                "Train with a lower train.optimizer.lr, and check the camera poses.",
+                "Train with a lower train.optimizer.lr, from the checkpoint of the step before or "
+                "from the start, and check the camera poses.",
             )
     return values
+
+
+def _is_finite(model: Model) -> bool:
+    """Whether a checkpoint of the model is worth keeping."""
+    return all(bool(parameter.isfinite().all()) for parameter in model.parameters())
 
 
 def _time_is_up(elapsed_s: float, config: TrainConfig) -> bool:
@@ -291,9 +303,14 @@ def _progress(
 
 
 def _fingerprint(config: TrainConfig, seed: int, num_images: int) -> str:
-    """What must be the same for a checkpoint to fit. Limits and habits may change in between."""
+    """What must be the same for a checkpoint to fit.
+
+    Limits, habits and learning rates may change in between: a run that went astray goes on with a
+    lower rate.
+    """
     values = asdict(config)
-    for name in ("max_steps", "max_seconds", "checkpoint_seconds", "preview_every_steps", "device"):
+    free = ("max_steps", "max_seconds", "checkpoint_seconds", "preview_every_steps", "device")
+    for name in (*free, "optimizer"):
         del values[name]
     return json.dumps({"config": values, "seed": seed, "num_images": num_images}, sort_keys=True)
 

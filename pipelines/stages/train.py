@@ -29,7 +29,7 @@ from pipelines.nerf.checkpoint import load_checkpoint, save_model
 from pipelines.nerf.config import TrainConfig
 from pipelines.nerf.data import ImageData, load_images, split_indices
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.models.base import Model
 from pipelines.nerf.renderer import Renderer
 from pipelines.nerf.training import TrainProgress, train
 from pipelines.options import StageOptions, train_config
@@ -136,7 +136,7 @@ def _inside(root: Path, relative: str) -> Path:
     return path
 
 
-def _train(inputs: _Inputs, config: TrainConfig, ctx: StageContext, watcher: _Watcher) -> Nerfacto:
+def _train(inputs: _Inputs, config: TrainConfig, ctx: StageContext, watcher: _Watcher) -> Model:
     """Train, going on from the checkpoint; one that cannot be used is dropped."""
     checkpoint = ctx.checkpoint / _CHECKPOINT
     ctx.checkpoint.mkdir(parents=True, exist_ok=True)
@@ -158,7 +158,7 @@ def _train(inputs: _Inputs, config: TrainConfig, ctx: StageContext, watcher: _Wa
         return _fit(inputs, config, ctx, watcher)
 
 
-def _fit(inputs: _Inputs, config: TrainConfig, ctx: StageContext, watcher: _Watcher) -> Nerfacto:
+def _fit(inputs: _Inputs, config: TrainConfig, ctx: StageContext, watcher: _Watcher) -> Model:
     return train(
         inputs.images,
         inputs.cameras,
@@ -202,7 +202,7 @@ class _Watcher:
         message = f"step {progress.step}/{progress.max_steps}, {psnr:.1f} dB"
         self._ctx.progress(_TRAIN_SHARE * progress.fraction, message, progress.eta_s)
 
-    def on_preview(self, step: int, model: Nerfacto) -> None:
+    def on_preview(self, step: int, model: Model) -> None:
         self._ctx.check_cancelled()
         watched = (self._inputs.test or self._inputs.train)[0]
         cameras = self._inputs.cameras.select([watched]).resized(_PREVIEW_LONG_SIDE)

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pipelines.nerf.intervals import HISTOGRAM_PADDING, spacing_piecewise
 from pipelines.nerf.kernels.dense_layers import TILE, apply_layer
@@ -38,6 +39,7 @@ from pipelines.nerf.kernels.intervals import (
 )
 from pipelines.nerf.kernels.proposal import DensityNet, density_logits, pack_density
 from pipelines.nerf.kernels.runtime import compiled, run_threads
+from pipelines.nerf.models.base import Appearance, Model
 from pipelines.nerf.models.nerfacto import Nerfacto
 
 BLOCK_RAYS = 16
@@ -314,22 +316,39 @@ def _render(share, shares, model, origins, directions, rgb, accumulation, median
         )
 
 
+def supports(model: Model) -> bool:
+    """Whether the kernel knows the method and the parts it is made of."""
+    if not isinstance(model, Nerfacto):
+        return False
+    config = model.config
+    return (
+        config.position_encoding == "hash"
+        and config.direction_encoding == "spherical_harmonics"
+        and config.spacing == "piecewise"
+        and config.contraction in CONTRACTION_CODES
+    )
+
+
 def pack_model(
-    model: Nerfacto,
+    model: Model,
     *,
-    appearance: int | None = None,
+    appearance: Appearance = None,
     early_stop: float = 0.0,
     weight_threshold: float = 0.0,
 ) -> PackedModel:
     """The model as arrays. Tables are shared with a float32 model on the CPU, layers are copied.
 
-    appearance: whose training image's code to use; None for the mean code.
-    Raises ValueError for layers that the kernel does not know.
+    appearance: a code [A], whose training image's code to use, or None for the mean code.
+    Raises ValueError for a model that the kernel does not know (`supports`).
     """
+    if not (isinstance(model, Nerfacto) and supports(model)):
+        raise ValueError(f"the kernel does not render this {type(model).__name__}")
     config, field = model.config, model.field
     with torch.no_grad():
         code = field.mean_code()
-        if appearance is not None and field.appearance is not None:
+        if isinstance(appearance, Tensor):
+            code = None if code is None else appearance
+        elif appearance is not None and field.appearance is not None:
             code = field.appearance.weight[appearance]
     ends = spacing_piecewise(torch.tensor([config.near, config.far], dtype=torch.float64))
     s_near, s_far = ends.tolist()

@@ -7,50 +7,46 @@ S samples. Fitting is left to `training`, whole pictures to `renderer`.
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import TypedDict
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from pipelines.nerf.camera_optimizer import CameraOptimizer
 from pipelines.nerf.config import NerfactoConfig
 from pipelines.nerf.encodings import HashGrid
 from pipelines.nerf.fields import DensityField, NerfactoField
 from pipelines.nerf.intervals import weights_from_density
-from pipelines.nerf.losses import color_loss, distortion_loss, interlevel_loss
-from pipelines.nerf.rays import Rays, RaySamples
-from pipelines.nerf.rendering import accumulation, composite, expected_depth, median_depth
+from pipelines.nerf.losses import (
+    color_loss,
+    distortion_loss,
+    interlevel_loss,
+    orientation_loss,
+    predicted_normal_loss,
+)
+from pipelines.nerf.models.base import Appearance, Model, Outputs, StepPlan, hash_grid_bytes
+from pipelines.nerf.normals import PredictedNormals, density_normals
+from pipelines.nerf.rays import Rays
+from pipelines.nerf.rendering import (
+    accumulation,
+    composite,
+    composite_normals,
+    expected_depth,
+    median_depth,
+)
 from pipelines.nerf.samplers import anneal_exponent, sample_proposals
 
 ALWAYS_UPDATE_BEFORE = 10
 
 
-class Outputs(TypedDict):
-    """What a batch of rays shows.
+class Nerfacto(Model):
+    """The model."""
 
-    rgb: [R, 3] in [0, 1]. accumulation: [R] in [0, 1].
-    depth: [R], median; expected_depth: [R]; both distances along the ray in scene units.
-    weights: [R, S] of each proposal round, then of the field; samples: likewise.
-    """
-
-    rgb: Tensor
-    accumulation: Tensor
-    depth: Tensor
-    expected_depth: Tensor
-    weights: list[Tensor]
-    samples: list[RaySamples]
-
-
-class Nerfacto(nn.Module):
-    """The model. `train()` and `eval()` switch jitter, camera corrections and appearance codes.
-
-    num_train_images: rows of the appearance codes and camera corrections.
-    """
+    config: NerfactoConfig
+    method = "nerfacto"
 
     def __init__(self, config: NerfactoConfig, num_train_images: int) -> None:
-        super().__init__()
+        super().__init__(config, num_train_images)
         self.config = config
-        self.num_train_images = num_train_images
         self.field = NerfactoField(config, num_train_images)
         num_networks = 1 if config.share_proposal_network else len(config.num_proposal_samples)
         self.proposals = nn.ModuleList(
@@ -61,49 +57,60 @@ class Nerfacto(nn.Module):
             )
             for proposal in config.proposals[:num_networks]
         )
-        self.cameras_delta = CameraOptimizer(
-            num_train_images,
-            config.camera_mode,
-            translation_penalty=config.camera_translation_penalty,
-            rotation_penalty=config.camera_rotation_penalty,
-        )
-
-    def set_engine(self, engine: str) -> None:
-        """Choose "plain" or "fast" for every hash grid; both have the same values."""
-        for module in self.modules():
-            if isinstance(module, HashGrid):
-                module.engine = engine
+        self.normal_head: PredictedNormals | None = None
+        if config.predict_normals:
+            self.normal_head = PredictedNormals(config.geo_feature_dim)
+        self.steps_since_update = 0
 
     def round_networks(self) -> list[nn.Module]:
         """The proposal network of each round, in order; the same one each time where shared."""
         num_rounds = len(self.config.num_proposal_samples)
         return [self.proposals[min(i, len(self.proposals) - 1)] for i in range(num_rounds)]
 
+    def plan_step(self, step: int, generator: torch.Generator | None = None) -> StepPlan:
+        """Anneal, and update the proposals when they are due (paper's schedule, Mip-NeRF 360)."""
+        del generator
+        config = self.config
+        return StepPlan(
+            step=step,
+            exponent=anneal_exponent(step, config.anneal_steps, config.anneal_slope),
+            update_proposals=proposals_due(step, self.steps_since_update + 1, config),
+        )
+
+    def finish_step(self, plan: StepPlan) -> None:
+        """Count the steps since the proposals learned."""
+        self.steps_since_update = 0 if plan.update_proposals else self.steps_since_update + 1
+
+    def schedule_state(self) -> dict[str, Any]:
+        """As `Model.schedule_state`."""
+        return {"steps_since_update": self.steps_since_update}
+
+    def load_schedule_state(self, state: dict[str, Any]) -> None:
+        """As `Model.load_schedule_state`."""
+        self.steps_since_update = int(state["steps_since_update"])
+
+    def set_engine(self, engine: str) -> None:
+        """As `Model.set_engine`. Learned normals need second derivatives, which only plain has."""
+        super().set_engine(engine)
+        if self.normal_head is not None and isinstance(self.field.grid, HashGrid):
+            self.field.grid.engine = "plain"
+
     def forward(
         self,
         rays: Rays,
         *,
-        step: int | None = None,
-        update_proposals: bool = True,
-        appearance: int | None = None,
+        plan: StepPlan | None = None,
+        appearance: Appearance = None,
         generator: torch.Generator | None = None,
     ) -> Outputs:
-        """What the rays show.
+        """As `Model.forward`. The proposals have a graph where the plan updates them.
 
-        rays: in training, `camera_indices` are indices of training images.
-        step: training step, for the annealing of proposal weights; None for the trained state.
-        update_proposals: false runs the proposals without a graph, so they cost no backward pass.
-        appearance: in `eval()`, whose training image's code to use; None for the mean code.
-        generator: random numbers for jitter and random background; None for neither.
         The nearest sample is at `config.near` also in `eval()`: nobody trained what lies before it.
         """
         config = self.config
-        if self.training:
-            rays = self.cameras_delta.apply_to(rays)
-        exponent = 1.0
-        if step is not None:
-            exponent = anneal_exponent(step, config.anneal_steps, config.anneal_slope)
-        with nullcontext() if update_proposals else torch.no_grad():
+        rays = self.corrected(rays)
+        plan = plan or StepPlan(0)
+        with nullcontext() if plan.update_proposals else torch.no_grad():
             final, samples, weights = sample_proposals(
                 rays,
                 self.round_networks(),
@@ -111,18 +118,20 @@ class Nerfacto(nn.Module):
                 config.num_nerf_samples,
                 config.near,
                 config.far,
-                exponent=exponent,
+                spacing=config.spacing,
+                exponent=plan.exponent,
                 single_jitter=config.single_jitter,
                 generator=generator,
             )
-        density, geometry = self.field.density(final.positions(rays))
-        found = weights_from_density(density, final.t_edges)
+        points = final.positions(rays)
+        density, geometry = self.field.density(points)
         colors = self.field.color(rays.directions, geometry, self._codes(rays, appearance))
+        found = weights_from_density(density, final.t_edges)
         rgb = composite(colors, found, config.background, generator=generator)
         with torch.no_grad():
             median = median_depth(found.detach(), final.t_edges)
             expected = expected_depth(found.detach(), final.t_edges)
-        return Outputs(
+        outputs = Outputs(
             rgb=rgb,
             accumulation=accumulation(found),
             depth=median,
@@ -130,19 +139,34 @@ class Nerfacto(nn.Module):
             weights=[*weights, found],
             samples=[*samples, final],
         )
+        if self.normal_head is not None:
+            self._add_normals(outputs, points, geometry, rays)
+        return outputs
+
+    def _add_normals(self, outputs: Outputs, points: Tensor, geometry: Tensor, rays: Rays) -> None:
+        """Normals from density and predicted ones, per sample for the losses and per ray."""
+        assert self.normal_head is not None
+        found = outputs["weights"][-1]
+        create_graph = self.training and torch.is_grad_enabled()
+        normals = density_normals(self.field.density_logits, points, create_graph=create_graph)
+        predicted = self.normal_head(self.field.unit(points).detach(), geometry)
+        outputs["extra"] = {
+            "normals": normals,
+            "predicted_normals": predicted,
+            "directions": rays.directions,
+        }
+        outputs["normals"] = composite_normals(normals.detach(), found.detach())
+        outputs["predicted_normals"] = composite_normals(predicted.detach(), found.detach())
 
     def loss_dict(
-        self, outputs: Outputs, truth: Tensor, *, update_proposals: bool = True
+        self, outputs: Outputs, truth: Tensor, *, plan: StepPlan | None = None
     ) -> dict[str, Tensor]:
-        """The terms whose sum is minimised, each a weighted scalar, by name.
-
-        truth: [R, 3] in [0, 1]. The interlevel term is left out where the proposals have no graph.
-        """
+        """As `Model.loss_dict`; no interlevel term where the proposals have no graph."""
         config = self.config
         *proposal_weights, weights = outputs["weights"]
         *proposal_samples, final = outputs["samples"]
         losses = {"rgb": color_loss(outputs["rgb"], truth)}
-        if update_proposals and config.interlevel_weight > 0.0:
+        if (plan is None or plan.update_proposals) and config.interlevel_weight > 0.0:
             edges = [samples.s_edges for samples in proposal_samples]
             pairs = list(zip(edges, proposal_weights, strict=True))
             interlevel = interlevel_loss(final.s_edges, weights, pairs)
@@ -150,20 +174,55 @@ class Nerfacto(nn.Module):
         if config.distortion_weight > 0.0:
             distortion = distortion_loss(final.s_edges, weights)
             losses["distortion"] = config.distortion_weight * distortion
+        if self.normal_head is not None:
+            extra, fixed = outputs["extra"], weights.detach()
+            normals, predicted = extra["normals"], extra["predicted_normals"]
+            losses["orientation"] = config.orientation_weight * orientation_loss(
+                fixed, normals, extra["directions"]
+            )
+            losses["predicted_normal"] = config.predicted_normal_weight * predicted_normal_loss(
+                fixed, normals.detach(), predicted
+            )
         if config.camera_mode != "off":
             losses["camera"] = self.cameras_delta.penalty()
         return losses
 
-    def _codes(self, rays: Rays, appearance: int | None) -> Tensor | None:
+    def density(self, points: Tensor) -> Tensor:
+        """As `Model.density`."""
+        return self.field.density(points)[0]
+
+    @property
+    def appearance_dim(self) -> int:
+        """As `Model.appearance_dim`."""
+        return self.config.appearance_dim
+
+    def mean_appearance(self) -> Tensor | None:
+        """As `Model.mean_appearance`."""
+        return self.field.mean_code()
+
+    def bytes_per_ray(self) -> int:
+        """As `Model.bytes_per_ray`."""
+        counts = [*self.config.num_proposal_samples, self.config.num_nerf_samples]
+        grids = [net.grid for net in self.round_networks()] + [self.field.grid]
+        pairs = [
+            (count, grid)
+            for count, grid in zip(counts, grids, strict=True)
+            if isinstance(grid, HashGrid)
+        ]
+        return max(hash_grid_bytes(count, [grid]) for count, grid in pairs)
+
+    def _codes(self, rays: Rays, appearance: Appearance) -> Tensor | None:
         if self.training:
             return self.field.codes(rays.camera_indices)
-        if appearance is None:
-            code = self.field.mean_code()
+        if self.field.appearance is None:
+            return None
+        if isinstance(appearance, Tensor):
+            code = appearance
+        elif appearance is not None:
+            code = self.field.appearance.weight[appearance]
         else:
-            index = torch.tensor([appearance], device=rays.origins.device)
-            chosen = self.field.codes(index)
-            code = None if chosen is None else chosen[0]
-        return None if code is None else code.expand(len(rays), -1)
+            code = self.field.appearance.weight.mean(dim=0)
+        return code.expand(len(rays), -1)
 
 
 def proposal_update_interval(step: int, config: NerfactoConfig) -> float:

@@ -9,7 +9,13 @@ import pytest
 import torch
 
 from pipelines.nerf.config import HashGridConfig
-from pipelines.nerf.encodings import HashGrid, level_layout, spherical_harmonics
+from pipelines.nerf.encodings import (
+    HashGrid,
+    SphericalHarmonics,
+    level_layout,
+    spherical_harmonics,
+)
+from pipelines.nerf.errors import NerfError
 
 SMALL = HashGridConfig(num_levels=4, min_res=3, max_res=24, log2_table_size=8, features_per_level=2)
 
@@ -75,6 +81,12 @@ def test_one_level_has_the_smallest_resolution() -> None:
     assert level_layout(HashGridConfig(num_levels=1)).resolutions == [16]
 
 
+def test_a_level_that_fills_its_table_exactly_is_dense() -> None:
+    config = HashGridConfig(num_levels=2, min_res=7, max_res=8, log2_table_size=9)
+    assert level_layout(config).dense == [True, False]  # 8^3 = 2^9 < 9^3
+    assert level_layout(config).offsets == [0, 512, 1024]
+
+
 def test_a_vertex_of_a_dense_level_reads_its_own_entry(grid: HashGrid) -> None:
     vertex = torch.tensor([1, 2, 3])
     features = grid(vertex.double() / 3.0)
@@ -131,3 +143,105 @@ def test_spherical_harmonics_are_orthonormal() -> None:
     values = spherical_harmonics(torch.from_numpy(directions))
     gram = values.T @ (weights[:, None] * values)
     assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=1e-12)
+
+
+def _slow_table_gradient(point: list[float], grid: HashGrid, column: int) -> dict[int, float]:
+    """d feature[column] / d table[entry]: the summed weights of the corners stored there."""
+    config = grid.config
+    level, first = column // config.features_per_level, 0
+    size = 2**config.log2_table_size
+    growth = (config.max_res / config.min_res) ** (1.0 / (config.num_levels - 1))
+    for below in range(level):
+        cells = math.floor(config.min_res * growth**below + 1e-6)
+        first += min((cells + 1) ** 3, size)
+    cells = math.floor(config.min_res * growth**level + 1e-6)
+    position = [value * cells for value in point]
+    gradient: dict[int, float] = {}
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = (int(position[axis]) + corner[axis] for axis in range(3))
+        weight = math.prod(
+            1.0 - abs(place - vertex) for place, vertex in zip(position, (x, y, z), strict=True)
+        )
+        if (cells + 1) ** 3 <= size:
+            entry = x + (cells + 1) * (y + (cells + 1) * z)
+        else:
+            entry = (x ^ (2654435761 * y % 2**32) ^ (805459861 * z % 2**32)) % size
+        gradient[first + entry] = gradient.get(first + entry, 0.0) + weight
+    return gradient
+
+
+def test_table_gradients_are_the_corner_weights_on_dense_and_hashed_levels(grid: HashGrid) -> None:
+    point = [0.31, 0.62, 0.87]
+    for column in range(grid.num_outputs):
+        feature = grid(torch.tensor(point, dtype=torch.float64))[column]
+        (found,) = torch.autograd.grad(feature, grid.table)
+        expected = torch.zeros_like(found)
+        for entry, weight in _slow_table_gradient(point, grid, column).items():
+            expected[entry, column % 2] = weight
+        assert torch.allclose(found, expected, atol=1e-12)
+        assert float(found.sum()) == pytest.approx(1.0)
+
+
+def test_the_plain_grid_is_differentiable_twice(grid: HashGrid) -> None:
+    # Normals in training need d/d table of d/d points; points away from cell faces.
+    points = torch.rand(2, 3, dtype=torch.float64) * 0.9 + 0.05
+    distance = (points[:, None] * grid.resolutions[:, None] % 1.0 - 0.5).abs()
+    assert distance.max() < 0.5 - 1e-4
+    points.requires_grad_()
+
+    def encode(points: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(grid, {"table": table}, points)
+
+    assert torch.autograd.gradgradcheck(encode, (points, grid.table), fast_mode=True)
+
+
+def test_the_compiled_grid_refuses_second_derivatives() -> None:
+    torch.manual_seed(0)
+    grid = HashGrid(SMALL)
+    points = torch.rand(5, 3, requires_grad=True)
+    (once,) = torch.autograd.grad(grid(points).sum(), points)
+    grid.engine = "fast"
+    (found,) = torch.autograd.grad(grid(points).sum(), points)
+    assert torch.allclose(found, once, atol=1e-6)
+    with pytest.raises(NerfError, match="engine 'plain'") as caught:
+        torch.autograd.grad(grid(points).sum(), points, create_graph=True)
+    assert caught.value.code == "bad_config"
+
+
+def _legendre(degree: int, m: int, z: float) -> float:
+    """Associated Legendre function with the Condon-Shortley phase, by repeated derivatives."""
+    coefficients = np.polynomial.legendre.leg2poly([0.0] * degree + [1.0])
+    bent = np.polynomial.polynomial.polyder(coefficients, m) if m else coefficients
+    return float((-1.0) ** m * (1.0 - z * z) ** (m / 2) * np.polynomial.polynomial.polyval(z, bent))
+
+
+def test_every_spherical_harmonic_equals_its_definition() -> None:
+    # Y_lm = sqrt(2) K P_l^|m|(cos theta) {cos(m phi), sin(|m| phi)}, l from 0, m from -l to l.
+    generator = np.random.default_rng(0)
+    for z, phi in generator.uniform([-1.0, -np.pi], [1.0, np.pi], (20, 2)).tolist():
+        expected = []
+        for degree in range(4):
+            for m in range(-degree, degree + 1):
+                order = abs(m)
+                ratio = math.factorial(degree - order) / math.factorial(degree + order)
+                norm = math.sqrt((2 * degree + 1) / (4 * math.pi) * ratio)
+                wave = math.cos(m * phi) if m >= 0 else math.sin(order * phi)
+                scale = math.sqrt(2.0) if m else 1.0
+                expected.append(scale * norm * _legendre(degree, order, z) * wave)
+        ring = math.sqrt(1.0 - z * z)
+        direction = [ring * math.cos(phi), ring * math.sin(phi), z]
+        found = spherical_harmonics(torch.tensor(direction, dtype=torch.float64))
+        assert found.tolist() == pytest.approx(expected, abs=1e-12)
+
+
+def test_spherical_harmonics_as_a_component_give_the_same_values() -> None:
+    directions = torch.nn.functional.normalize(torch.randn(4, 2, 3, dtype=torch.float64), dim=-1)
+    encoding = SphericalHarmonics()
+    assert encoding.num_outputs == 16
+    assert torch.equal(encoding(directions), spherical_harmonics(directions))
+
+
+def test_spherical_harmonics_have_the_right_gradients() -> None:
+    directions = torch.randn(4, 3, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(directions, dim=-1).requires_grad_()
+    assert torch.autograd.gradcheck(spherical_harmonics, (directions,))

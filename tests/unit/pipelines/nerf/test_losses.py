@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from pipelines.nerf.losses import distortion_loss, interlevel_loss, outer_measure
+from pipelines.nerf.losses import (
+    color_loss,
+    distortion_loss,
+    interlevel_loss,
+    orientation_loss,
+    outer_measure,
+    predicted_normal_loss,
+)
 
 
 def _histogram(rays: int, num: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -98,3 +106,93 @@ def test_distortion_gradient_is_right() -> None:
     edges, weights = _histogram(3, 6, seed=4)
     start = weights.requires_grad_()
     assert torch.autograd.gradcheck(lambda w: distortion_loss(edges, w), start)
+
+
+def test_distortion_gradient_in_the_edges_is_right() -> None:
+    edges, weights = _histogram(3, 6, seed=4)
+    assert torch.autograd.gradcheck(lambda e: distortion_loss(e, weights), edges.requires_grad_())
+
+
+def test_distortion_of_two_points_is_their_distance_and_their_widths() -> None:
+    # w = (1/2, 1/2) at 0.25 and 0.75, both 0.1 wide: 2 (1/4)(1/2) + (1/3) 2 (1/4)(0.1).
+    edges = torch.tensor([[0.2, 0.3, 0.7, 0.8]], dtype=torch.float64)
+    weights = torch.tensor([[0.5, 0.0, 0.5]], dtype=torch.float64)
+    assert float(distortion_loss(edges, weights)) == pytest.approx(0.25 + 0.05 / 3.0)
+
+
+def test_color_loss_is_the_mean_over_rays_and_channels() -> None:
+    predicted = torch.tensor([[0.1, 0.5, 1.0], [0.0, 0.2, 0.4]])
+    truth = torch.tensor([[0.1, 0.3, 0.5], [0.3, 0.2, 0.5]])
+    expected = (0.0 + 0.04 + 0.25 + 0.09 + 0.0 + 0.01) / 6.0
+    assert float(color_loss(predicted, truth)) == pytest.approx(expected)
+
+
+def _normals(seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    vectors = torch.randn(4, 6, 3, generator=generator, dtype=torch.float64)
+    return vectors / vectors.norm(dim=-1, keepdim=True)
+
+
+def test_orientation_loss_equals_the_loop() -> None:
+    _, weights = _histogram(4, 6, seed=5)
+    normals, directions = _normals(0), _normals(1)[:, 0]
+    expected, num_away = 0.0, 0
+    for ray in range(4):
+        for i in range(6):
+            along = sum(float(normals[ray, i, k] * directions[ray, k]) for k in range(3))
+            if along > 0.0:  # looks the way the ray goes: away from the camera
+                expected += float(weights[ray, i]) * along**2
+                num_away += 1
+    assert 0 < num_away < 24
+    found = orientation_loss(weights, normals, directions)
+    assert float(found) == pytest.approx(expected / 4.0, rel=1e-12)
+
+
+def test_orientation_loss_punishes_only_surfaces_seen_from_behind() -> None:
+    down = torch.tensor([[0.0, 0.0, -1.0]])  # a camera above the ground, looking down
+    up = torch.tensor([[[0.0, 0.0, 1.0]]])
+    weights = torch.tensor([[0.5]])
+    assert float(orientation_loss(weights, up, down)) == 0.0
+    assert float(orientation_loss(weights, -up, down)) == 0.5
+
+
+def test_orientation_loss_turns_normals_towards_the_camera_and_leaves_weights() -> None:
+    _, weights = _histogram(4, 6, seed=5)
+    weights.requires_grad_()
+    normals, directions = _normals(0).requires_grad_(), _normals(1)[:, 0]
+    orientation_loss(weights, normals, directions).backward()
+    assert weights.grad is None
+    assert normals.grad is not None
+    # Going down the gradient takes away from what looks along the ray, and never adds to it.
+    change = -(normals.grad * directions[:, None, :]).sum(-1)
+    away = (normals.detach() * directions[:, None, :]).sum(-1) > 0.0
+    assert bool((change[away] < 0.0).all())
+    assert not change[~away].any()
+    assert torch.autograd.gradcheck(
+        lambda n: orientation_loss(weights.detach(), n, directions), normals
+    )
+
+
+def test_predicted_normal_loss_is_half_the_weighted_squared_distance() -> None:
+    _, weights = _histogram(4, 6, seed=6)
+    normals, predicted = _normals(2), _normals(3)
+    expected = 0.0
+    for ray in range(4):
+        for i in range(6):
+            gap = (normals[ray, i] - predicted[ray, i]).tolist()
+            expected += float(weights[ray, i]) * sum(value**2 for value in gap) / 2.0
+    found = predicted_normal_loss(weights, normals, predicted)
+    assert float(found) == pytest.approx(expected / 4.0, rel=1e-12)
+    assert float(predicted_normal_loss(weights, normals, normals)) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_predicted_normal_loss_trains_the_prediction_alone() -> None:
+    _, weights = _histogram(4, 6, seed=6)
+    weights.requires_grad_()
+    normals, predicted = _normals(2).requires_grad_(), _normals(3).requires_grad_()
+    predicted_normal_loss(weights, normals, predicted).backward()
+    assert weights.grad is None
+    assert normals.grad is None
+    assert predicted.grad is not None
+    expected = -weights.detach()[..., None] * normals.detach() / 4.0
+    assert torch.allclose(predicted.grad, expected, atol=1e-15)

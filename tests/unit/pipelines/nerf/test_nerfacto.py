@@ -10,6 +10,7 @@ import torch
 from pipelines.nerf.config import NerfactoConfig
 from pipelines.nerf.encodings import spherical_harmonics
 from pipelines.nerf.fields import MLP, DensityField, NerfactoField, truncated_exp
+from pipelines.nerf.models.base import StepPlan
 from pipelines.nerf.models.nerfacto import (
     Nerfacto,
     proposal_update_interval,
@@ -134,8 +135,9 @@ def test_without_an_update_the_proposals_get_no_gradient() -> None:
     truth = torch.rand(20, 3)
     for update in (False, True):
         model.zero_grad(set_to_none=True)
-        outputs = model(_rays(), update_proposals=update)
-        losses = model.loss_dict(outputs, truth, update_proposals=update)
+        plan = StepPlan(0, update_proposals=update)
+        outputs = model(_rays(), plan=plan)
+        losses = model.loss_dict(outputs, truth, plan=plan)
         assert ("interlevel" in losses) is update
         torch.stack(list(losses.values())).sum().backward()
         grads = [parameter.grad for parameter in model.proposals.parameters()]
@@ -158,6 +160,6 @@ def test_every_background_and_contraction_gives_finite_losses(
 ) -> None:
     model = _model(background=background, contraction=contraction, appearance_dim=0).train()
     generator = torch.Generator().manual_seed(0)
-    outputs = model(_rays(), step=3, generator=generator)
+    outputs = model(_rays(), plan=model.plan_step(3), generator=generator)
     losses = model.loss_dict(outputs, torch.rand(20, 3))
     assert all(bool(loss.isfinite()) for loss in losses.values())

@@ -6,14 +6,19 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from pipelines.nerf.cameras import Cameras
+from pipelines.nerf.cameras import Cameras, SceneTransform
+from pipelines.nerf.checkpoint import load_checkpoint
+from pipelines.nerf.config import TensorGridConfig
 from pipelines.nerf.data import ImageData
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.metrics import psnr
+from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.renderer import Renderer
 from pipelines.nerf.training import TrainProgress, learning_rate, train
 from tests.unit.pipelines.nerf.toy_scene import (
     RADIUS,
@@ -22,6 +27,7 @@ from tests.unit.pipelines.nerf.toy_scene import (
     toy_cameras,
     toy_color,
     toy_images,
+    with_model,
 )
 
 HELD_OUT = 5
@@ -41,9 +47,11 @@ def images(cameras: Cameras) -> ImageData:
 def trained(images: ImageData, cameras: Cameras) -> Nerfacto:
     config = tiny_config(max_steps=200, rays_per_step=512, engine="fast")
     # The poses are true: corrections could only fit noise.
-    config = replace(config, model=replace(config.model, camera_mode="off"))
+    config = with_model(config, camera_mode="off")
     indices = [index for index in range(len(cameras)) if index != HELD_OUT]
-    return train(images, cameras, indices, config, seed=0)
+    model = train(images, cameras, indices, config, seed=0)
+    assert isinstance(model, Nerfacto)
+    return model
 
 
 def _held_out_psnr(model: Nerfacto, images: ImageData, cameras: Cameras) -> float:
@@ -71,7 +79,7 @@ def test_the_depth_of_the_ball_is_found(trained: Nerfacto, cameras: Cameras) -> 
     assert float(error.median()) < 0.2 * RADIUS
 
 
-def _same_parameters(one: Nerfacto, other: Nerfacto) -> bool:
+def _same_parameters(one: Model, other: Model) -> bool:
     pairs = zip(one.state_dict().values(), other.state_dict().values(), strict=True)
     return all(torch.equal(a, b) for a, b in pairs)
 
@@ -86,7 +94,7 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(
 ) -> None:
     config = tiny_config(max_steps=30, engine=engine)
     # Rare proposal updates, so that the count since the last one matters.
-    config = replace(config, model=replace(config.model, proposal_warmup_steps=10))
+    config = with_model(config, proposal_warmup_steps=10)
     indices = list(range(8))
     whole = train(images, cameras, indices, config, seed=3)
 
@@ -138,7 +146,8 @@ def test_a_checkpoint_of_another_run_is_refused(
 
 
 def test_a_loss_that_is_not_finite_is_named(images: ImageData, cameras: Cameras) -> None:
-    def spoil(step: int, model: Nerfacto) -> None:
+    def spoil(step: int, model: Model) -> None:
+        assert isinstance(model, Nerfacto)
         if step == 2:
             layer = model.field.color_mlp.layers[0]
             assert isinstance(layer, torch.nn.Linear)
@@ -148,6 +157,84 @@ def test_a_loss_that_is_not_finite_is_named(images: ImageData, cameras: Cameras)
     with pytest.raises(NerfError, match="rgb loss became nan at step 2") as caught:
         train(images, cameras, [0, 1], config, seed=0, on_preview=spoil)
     assert caught.value.code == "non_finite_loss"
+
+
+def test_before_a_loss_that_is_not_finite_a_checkpoint_is_saved_to_go_on_from(
+    images: ImageData, cameras: Cameras, tmp_path: Path
+) -> None:
+    def spoil(step: int, model: Model) -> None:
+        assert isinstance(model, Nerfacto)
+        if step == 2:  # finite parameters whose products are not
+            for layer in model.field.color_mlp.layers[:2]:
+                next(layer.parameters()).fill_(1e30)
+
+    path = tmp_path / "checkpoint.pt"
+    config = tiny_config(max_steps=5, preview_every_steps=1)
+    with pytest.raises(NerfError, match="at step 2") as caught:
+        train(images, cameras, [0, 1], config, seed=0, checkpoint_path=path, on_preview=spoil)
+    assert "train.optimizer.lr" in caught.value.hint
+    saved = load_checkpoint(path)
+    assert saved["step"] == 2
+    # The run may go on from it with a lower rate.
+    slower = replace(config, optimizer=replace(config.optimizer, lr=1e-4, lr_final=1e-4))
+    with pytest.raises(NerfError, match="at step 2"):
+        train(images, cameras, [0, 1], slower, seed=0, checkpoint_path=path)
+
+
+def test_a_model_that_is_not_finite_itself_does_not_replace_the_checkpoint(
+    images: ImageData, cameras: Cameras, tmp_path: Path
+) -> None:
+    def spoil(step: int, model: Model) -> None:
+        assert isinstance(model, Nerfacto)
+        if step == 2:
+            model.field.grid.table.fill_(math.nan)
+
+    path = tmp_path / "checkpoint.pt"
+    config = tiny_config(max_steps=5, preview_every_steps=1)
+    with pytest.raises(NerfError, match="at step 2"):
+        train(images, cameras, [0, 1], config, seed=0, checkpoint_path=path, on_preview=spoil)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"position_encoding": "vm"},
+        {"position_encoding": "cp"},
+        {"position_encoding": "voxel"},
+        {"position_encoding": "fourier"},
+        {"direction_encoding": "fourier"},
+        {"spacing": "uniform", "near": 0.3, "far": 2.0},
+        {"spacing": "disparity", "near": 0.3, "far": 20.0},
+        {"predict_normals": True},
+        {"camera_mode": "se3"},
+        {"num_proposal_samples": (24,)},
+    ],
+)
+def test_a_model_of_other_parts_learns(
+    images: ImageData, cameras: Cameras, parts: dict[str, object]
+) -> None:
+    small = TensorGridConfig(resolution=16, num_components=4)
+    config = with_model(tiny_config(max_steps=40), tensor_grid=small, **parts)
+    psnr: list[float] = []
+    trained = train(
+        images,
+        cameras,
+        list(range(8)),
+        config,
+        seed=0,
+        on_progress=lambda progress: psnr.append(progress.psnr),
+    )
+    # A grey start shows about 14 dB; the first steps must have been learned from.
+    assert sum(psnr[-5:]) / 5 > sum(psnr[:3]) / 3 + 1.0
+    scene = SceneTransform((0.0, 0.0, 0.0), 1.0)
+    wants_normals = "predict_normals" in parts
+    picture = Renderer(trained, scene, normals=wants_normals).render(cameras, 0)
+    assert np.isfinite(picture.rgb).all()
+    for normals in (picture.normals, picture.predicted_normals):
+        assert (normals is not None) is wants_normals
+        if normals is not None:
+            assert np.allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-3)
 
 
 def test_progress_previews_and_checkpoints_are_reported(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -98,3 +100,8 @@ def tiny_config(**changes: object) -> TrainConfig:
         "optimizer": OptimizerConfig(decay_steps=1000),
     }
     return TrainConfig(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def with_model(config: TrainConfig, **changes: Any) -> TrainConfig:
+    """The run with other options of its model."""
+    return replace(config, model=replace(config.model, **changes))
