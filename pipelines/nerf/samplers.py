@@ -7,6 +7,7 @@ the samples are the middle ones, as in rendering.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,6 +24,11 @@ from pipelines.nerf.rays import Rays, RaySamples
 
 DensityFunction = Callable[[Tensor], Tensor]
 """Scene points [..., 3] to densities [...], per scene unit."""
+
+
+def weigh_density(density: Any, rays: Rays, samples: RaySamples) -> Tensor:
+    """The weights [R, S] of a `DensityFunction` along rays."""
+    return weights_from_density(density(samples.positions(rays)), samples.t_edges)
 
 
 def uniform_jitter(
@@ -88,12 +94,15 @@ def sample_proposals(
     exponent: float = 1.0,
     single_jitter: bool = True,
     generator: torch.Generator | None = None,
+    weigh: Callable[[Any, Rays, RaySamples], Tensor] = weigh_density,
+    resample: Callable[..., Tensor] = sample_pdf,
 ) -> tuple[RaySamples, list[RaySamples], list[Tensor]]:
     """Rounds of proposals, each drawing the next round's samples where it found mass.
 
     densities: one function per round, at least one; the same one may serve several rounds.
     num_proposal_samples: intervals of each round. near, far, spacing: see `sample_along`.
-    exponent: see `anneal_exponent`.
+    exponent: see `anneal_exponent`. weigh, resample: compiled twins of `weigh_density` and
+    `intervals.sample_pdf`, where the caller has them.
     Returns (final samples, samples of each round, weights [R, S] of each round). Positions carry no
     gradient to the rays: cameras are moved by the colour loss alone, and half of the proposals'
     backward pass is spared. Weights carry one to the networks unless under `torch.no_grad()`.
@@ -121,13 +130,13 @@ def sample_proposals(
     weights: list[Tensor] = []
     wanted = (*num_proposal_samples[1:], num_final_samples)
     for density, num_next in zip(densities, wanted, strict=True):
-        found = weights_from_density(density(samples.positions(fixed)), samples.t_edges)
+        found = weigh(density, fixed, samples)
         rounds.append(samples)
         weights.append(found)
         jitter = uniform_jitter(len(rays), num_next + 1, single_jitter, generator, found)
         # At exponent 0 even a weight of 0 counts as 1, as torch.pow has it: a flat histogram.
         shape = found.detach() if exponent == 1.0 else found.detach().pow(exponent)
-        edges = sample_pdf(samples.s_edges, shape, num_next, jitter=jitter)
+        edges = resample(samples.s_edges, shape, num_next, jitter=jitter)
         samples = RaySamples(s_edges=edges, t_edges=t_from_s(edges, near, far, spacing))
     return samples, rounds, weights
 

@@ -100,9 +100,10 @@ class _State:
             item.load_state_dict(saved["optimizers"][name])
         if saved["scaler"] and self.scaler.is_enabled():
             self.scaler.load_state_dict(saved["scaler"])
-        self.pixel_random.set_state(saved["pixel_random"])
-        if saved["model_random"].shape == self.model_random.get_state().shape:
-            self.model_random.set_state(saved["model_random"])  # else: another kind of device
+        for name in ("pixel_random", "model_random"):
+            random: torch.Generator = getattr(self, name)
+            if saved[name].shape == random.get_state().shape:  # else: another kind of device
+                random.set_state(saved[name])
         self.step = int(saved["step"])
         self.model.load_schedule_state(saved["schedule"])
         self.elapsed_s = float(saved["elapsed_s"])
@@ -138,7 +139,7 @@ def train(
     state = _initial_state(config, len(train_indices), seed, device)
     if checkpoint_path is not None and checkpoint_path.exists():
         _resume(state, checkpoint_path, fingerprint)
-    sampler = PixelSampler(images, train_indices)
+    sampler = PixelSampler(images, train_indices, state.pixel_random.device)
     posed = cameras.select(train_indices).to(device)
     model = state.model.train()
     preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
@@ -171,6 +172,8 @@ def train(
                 on_preview(state.step, model.eval())
             model.train()
     save()
+    for parameter in model.parameters():
+        parameter.grad = None
     return model.eval()
 
 
@@ -194,8 +197,8 @@ def _optimise_once(
         losses = model.loss_dict(outputs, colors, plan=plan)
     values = _checked_values(losses, state.step) if check else {}
 
-    for parameter in model.parameters():
-        parameter.grad = None  # Adam leaves alone what has no gradient: proposals between updates
+    for optimizer in state.optimizers.values():
+        optimizer.zero_grad()  # what gets no gradient is left alone: proposals between updates
     total = torch.stack(list(losses.values())).sum()
     torch.autograd.backward(state.scaler.scale(total))
     for optimizer in state.optimizers.values():
@@ -227,7 +230,16 @@ def _initial_state(config: TrainConfig, num_images: int, seed: int, device: torc
     model.set_engine("fast" if fast else "plain")
     networks = list(model.network_parameters())
     rates = config.optimizer
-    optimizers = {"networks": torch.optim.Adam(networks, lr=rates.lr, eps=rates.eps, fused=True)}
+    if fast and not on_gpu:
+        # Imported here: a machine that trains on a GPU never loads the compiler.
+        from pipelines.nerf.kernels.engine import make_adam
+        from pipelines.nerf.kernels.gradients import accumulate_in_place
+
+        accumulate_in_place(model)
+        adam = make_adam(networks, rates.lr, rates.eps)
+    else:
+        adam = torch.optim.Adam(networks, lr=rates.lr, eps=rates.eps, fused=True)
+    optimizers = {"networks": adam}
     if config.model.camera_mode != "off":
         optimizers["cameras"] = torch.optim.Adam(
             model.cameras_delta.parameters(), lr=rates.camera_lr, eps=rates.eps
@@ -236,7 +248,9 @@ def _initial_state(config: TrainConfig, num_images: int, seed: int, device: torc
         model=model,
         optimizers=optimizers,
         scaler=torch.amp.GradScaler(device.type, enabled=on_gpu),
-        pixel_random=torch.Generator().manual_seed(seed),
+        pixel_random=torch.Generator(device if config.data.images_on_gpu else "cpu").manual_seed(
+            seed
+        ),
         model_random=torch.Generator(device).manual_seed(seed + 1),
     )
 

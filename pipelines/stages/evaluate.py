@@ -1,8 +1,10 @@
 """The evaluate stage: pictures of the held-out views beside the truth, and how close they are.
 
-Reads `train/model.zip` and the images. Held-out views keep the poses of the capture, are rendered
-with the mean appearance code at the size that was trained on, and nothing is fitted to them.
-Writes `metrics.json` and `images/<name>.jpg`: truth | render | error.
+Reads `train/model.zip` and the images with their masks. Held-out views are rendered at the size
+that was trained on, with the capture's poses and the mean appearance code, or, where the options
+ask for it, with what the test-time procedure fitted (`pipelines.nerf.test_time`); pixels that a
+mask leaves out are not measured. `protocol` says which of this was done. Writes `metrics.json` and
+`images/<name>.jpg`: truth | render | error.
 """
 
 from __future__ import annotations
@@ -10,6 +12,9 @@ from __future__ import annotations
 import json
 import re
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,56 +22,126 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from pipelines.cameras_file import PosedImage
 from pipelines.errors import ExportError
-from pipelines.nerf.data import load_images
+from pipelines.evaluation_protocol import protocol
+from pipelines.nerf.cameras import Cameras
+from pipelines.nerf.data import ImageData, load_images
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.evaluation_config import EvaluateConfig
+from pipelines.nerf.floaters import floater_measures, opacity_of_density
+from pipelines.nerf.lpips import Lpips, lpips_if_configured
 from pipelines.nerf.metrics import psnr, ssim
-from pipelines.options import EvaluateOptions
+from pipelines.nerf.off_path import off_path_cameras
+from pipelines.nerf.renderer import RenderedImage, Renderer
+from pipelines.nerf.test_time import (
+    FittedCodes,
+    FittedPoses,
+    fit_appearance,
+    fit_poses,
+    half_columns,
+    other_half,
+)
+from pipelines.options import StageOptions, evaluate_config
 from pipelines.stage import StageContext
-from pipelines.trained_scene import TrainedScene, as_uint8, nerf_errors_as
+from pipelines.trained_scene import TrainedScene, as_uint8, nerf_cameras, nerf_errors_as
+
+MEASURES = {"psnr": 4, "ssim": 5, "lpips": 5}
+"""What is measured, and the decimals kept."""
+MAX_PSNR = 100.0
 
 _ERROR_FULL_SCALE = 0.25
 _ERROR_STOPS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 _ERROR_COLORS = np.array(
     [[0, 0, 4], [87, 16, 110], [188, 55, 84], [249, 142, 9], [252, 255, 164]], np.float64
 )
-_PROTOCOL = (
-    "Held-out images at equal intervals, never trained on; poses as the capture gave them; mean "
-    "appearance code; no fitting at test time; PSNR of the mean squared error over all pixels and "
-    "channels of an sRGB image in [0, 1]; SSIM with an 11x11 Gaussian window, sigma 1.5; the mean "
-    "over images."
-)
-_NO_LPIPS = "LPIPS needs the weights of a pretrained network, which are not part of this program."
+_FIT_COST = 10
+"""What a fitted pixel costs in pixels rendered, about: for the estimate of the time left."""
+_FLOATER_COST = 20_000
+"""What the mass before the training cameras costs, likewise."""
 
 
-def run(options: EvaluateOptions, ctx: StageContext) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Views:
+    """The N held-out views that are measured, at the size that was trained on.
+
+    poses: [N, 3, 4] float64, world; cameras: the same in scene space.
+    """
+
+    posed: list[PosedImage]
+    images: ImageData
+    cameras: Cameras
+    poses: NDArray[np.float64]
+    long_side: int
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """What the test-time procedure found; None for what was not asked for."""
+
+    poses: FittedPoses | None = None
+    codes: FittedCodes | None = None
+
+
+class _Meter:
+    """Progress over parts of the stage, each a share of the whole by what it costs."""
+
+    def __init__(self, ctx: StageContext, costs: dict[str, float]) -> None:
+        self._ctx = ctx
+        self._costs = costs
+        self._started = time.monotonic()
+
+    def show(self, part: str, share: float, message: str) -> None:
+        """`share` of a part is done, and all parts before it."""
+        names = list(self._costs)
+        before = sum(self._costs[name] for name in names[: names.index(part)])
+        fraction = (before + share * self._costs[part]) / sum(self._costs.values())
+        eta = None
+        if fraction > 0.0:
+            eta = (time.monotonic() - self._started) * (1.0 - fraction) / fraction
+        self._ctx.progress(fraction, message, eta)
+
+    def of(self, part: str, message: str) -> Callable[[float], None]:
+        return lambda share: self.show(part, share, message)
+
+
+def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     """Measure. The summary is the content of `metrics.json`; without held-out images it is null."""
+    config = evaluate_config(options)
     scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip")
-    images = _picked(scene.test_images(), options.max_images)
-    long_side = int(scene.extras["train"]["data"]["long_side_px"])
+    if next(scene.model.parameters()).device.type == "cpu":
+        scene.model.set_engine("fast")  # fits and densities ask the model itself, no renderer
     (ctx.out / "images").mkdir(exist_ok=True)
+    lpips, no_lpips = _lpips(config, ctx)
+    views = _load_views(scene, config, ctx.workspace.images_root)
+    meter = _Meter(ctx, _costs(views, config, scene))
     rows: list[dict[str, Any]] = []
-    started = time.monotonic()
-    for done, image in enumerate(images, start=1):
-        truth, shown = _pair(scene, image, ctx.workspace.images_root, long_side)
+    fits = _Fits()
+    if views is not None:
         with nerf_errors_as(ExportError):
-            row = {
-                "file": image.file,
-                "psnr": round(min(psnr(shown, truth), 100.0), 4),
-                "ssim": round(ssim(shown, truth), 5),
-                "width": truth.shape[1],
-                "height": truth.shape[0],
-            }
-        rows.append(row)
-        picture = side_by_side(truth.numpy(), shown.numpy())
-        Image.fromarray(picture).save(
-            ctx.out / "images" / f"{picture_name(image.file)}.jpg", quality=90
-        )
-        eta = (time.monotonic() - started) / done * (len(images) - done)
-        ctx.progress(done / len(images), f"image {done}/{len(images)}, {row['psnr']:.1f} dB", eta)
-    metrics = summarise(rows)
+            fits = _fit(scene, views, config, ctx.seed, meter)
+        poses = views.poses
+        if fits.poses is not None:
+            poses = fits.poses.moved(poses, scene.scene.scale)
+        for index in range(len(views.posed)):
+            rows.append(_measure_view(scene, views, index, poses[index], fits, lpips, ctx.out))
+            shown = rows[-1]["psnr"]
+            text = f"image {index + 1}/{len(views.posed)}"
+            text += "" if shown is None else f", {shown:.1f} dB"
+            meter.show("images", (index + 1) / len(views.posed), text)
+    floaters, no_floaters = _floaters(scene, config, ctx.seed, meter)
+    metrics = {
+        **summarise(rows),
+        "lpips_reason": no_lpips,
+        "lpips_backbone": None if lpips is None else lpips.backbone,
+        "protocol": protocol(scene.extras["train"], config, has_codes(scene)),
+        "floaters": floaters,
+        "floaters_reason": no_floaters,
+    }
     (ctx.out / "metrics.json").write_text(json.dumps(metrics, indent=1), "utf-8")
+    ctx.progress(1.0, "measured", 0.0)
     return metrics
 
 
@@ -78,43 +153,231 @@ def _picked(images: list[PosedImage], at_most: int) -> list[PosedImage]:
     return [images[row] for row in rows]
 
 
-def _pair(
-    scene: TrainedScene, image: PosedImage, root: Path, long_side: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Truth and render of one image, [H, W, 3] float32 in [0, 1] on the CPU."""
+def _load_views(scene: TrainedScene, config: EvaluateConfig, root: Path) -> _Views | None:
+    """The held-out images, their masks and cameras; None where nothing was held out."""
+    posed = _picked(scene.test_images(), config.max_images)
+    if not posed:
+        return None
+    long_side = int(scene.extras["train"]["data"]["long_side_px"])
+    poses = np.asarray([image.world_from_camera for image in posed], np.float64)
     with nerf_errors_as(ExportError):
-        truth = load_images([root / image.file], long_side).image(0)
-    pose = np.asarray(image.world_from_camera, np.float64)
-    rendered = scene.render(scene.lens_of(image), pose, long_side).rgb
-    shown = torch.as_tensor(rendered).detach().cpu().float().clamp(0.0, 1.0)
-    if shown.shape != truth.shape:
-        raise ExportError(
-            f"{image.file} is {truth.shape[1]}x{truth.shape[0]}, its camera "
-            f"{shown.shape[1]}x{shown.shape[0]}.",
-            code="bad_image",
-            hint="The image differs in size from its camera: start the job again.",
+        images = load_images(
+            [root / image.file for image in posed],
+            long_side,
+            [None if image.mask is None else root / image.mask for image in posed],
         )
-    return truth, shown
+        lenses = [scene.lens_of(image) for image in posed]
+        cameras = nerf_cameras(lenses, poses, scene.scene).resized(long_side)
+    for image, found, wanted in zip(
+        posed, images.sizes.tolist(), cameras.size.tolist(), strict=True
+    ):
+        if found != wanted:
+            raise ExportError(
+                f"{image.file} is {found[0]}x{found[1]}, its camera {wanted[0]}x{wanted[1]}.",
+                code="bad_image",
+                hint="The image differs in size from its camera: start the job again.",
+            )
+    return _Views(posed, images, cameras, poses, long_side)
+
+
+def has_codes(scene: TrainedScene) -> bool:
+    """Whether the model was trained with appearance codes."""
+    return scene.model.appearance_dim > 0
+
+
+def _costs(views: _Views | None, config: EvaluateConfig, scene: TrainedScene) -> dict[str, float]:
+    """What each part costs, in pixels rendered."""
+    num = 0 if views is None else len(views.posed)
+    fit = _FIT_COST * num * config.test_time.rays_per_step
+    side = config.floater_long_side_px
+    return {
+        "poses": fit * config.test_time.pose_steps if config.fit_poses else 0.0,
+        "appearance": fit * config.test_time.appearance_steps
+        if config.fit_appearance and has_codes(scene)
+        else 0.0,
+        "images": 0.0 if views is None else float(views.images.offsets[-1]),
+        "floaters": _FLOATER_COST + _floater_renders(config) * side**2 if config.floaters else 0.0,
+    }
+
+
+def _floater_renders(config: EvaluateConfig) -> int:
+    """Pictures' worth of rays that depth consistency asks for: each view, and twice each pair."""
+    return config.floater_views * (1 + 2 * (config.floater_views - 1))
+
+
+def _fit(
+    scene: TrainedScene, views: _Views, config: EvaluateConfig, seed: int, meter: _Meter
+) -> _Fits:
+    """The test-time procedure, as far as the options ask for it and the model has codes."""
+    rows = range(len(views.posed))
+    poses, codes, cameras = None, None, views.cameras
+    if config.fit_poses:
+        poses = fit_poses(
+            scene.model,
+            cameras,
+            views.images,
+            rows,
+            config.test_time,
+            seed=seed,
+            progress=meter.of("poses", "fitting held-out poses"),
+        )
+        cameras = poses.applied_to(cameras)
+    if config.fit_appearance and has_codes(scene):
+        codes = fit_appearance(
+            scene.model,
+            cameras,
+            views.images,
+            rows,
+            config.test_time,
+            seed=seed,
+            progress=meter.of("appearance", "fitting held-out appearance"),
+        )
+    return _Fits(poses, codes)
+
+
+def _measure_view(
+    scene: TrainedScene,
+    views: _Views,
+    index: int,
+    pose: NDArray[np.float64],
+    fits: _Fits,
+    lpips: Lpips | None,
+    out: Path,
+) -> dict[str, Any]:
+    """Render one view, save it beside the truth, and measure it: its row of `metrics.json`."""
+    image, truth, valid = views.posed[index], views.images.image(index), views.images.mask(index)
+    code = None if fits.codes is None else fits.codes.codes[index]
+    rendered = scene.render(scene.lens_of(image), pose, views.long_side, appearance=code)
+    shown = torch.as_tensor(rendered.rgb).detach().cpu().float().clamp(0.0, 1.0)
+    picture = side_by_side(truth.numpy(), shown.numpy())
+    Image.fromarray(picture).save(out / "images" / f"{picture_name(image.file)}.jpg", quality=90)
+    row: dict[str, Any] = {"file": image.file, **measure(shown, truth, valid, lpips)}
+    if valid is not None:
+        row["valid_share"] = round(float(valid.double().mean()), 4)
+    if fits.poses is not None:
+        before = views.poses[index]
+        cosine = (np.trace(before[:, :3].T @ pose[:, :3]) - 1.0) / 2.0
+        row["pose_fit"] = {
+            "translation": round(float(np.linalg.norm(pose[:, 3] - before[:, 3])), 6),
+            "rotation_deg": round(float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), 4),
+            "loss_before": fits.poses.loss_before[index],
+            "loss_after": fits.poses.loss_after[index],
+        }
+    if fits.codes is not None:
+        half = other_half(fits.codes.halves[index])
+        columns = half_columns(truth.shape[1], half)
+        part = None if valid is None else valid[:, columns]
+        row["half_unseen"] = {
+            "half": half,
+            **measure(shown[:, columns], truth[:, columns], part, lpips),
+        }
+    return row | {"width": truth.shape[1], "height": truth.shape[0]}
+
+
+def measure(
+    shown: Tensor, truth: Tensor, valid: Tensor | None, lpips: Lpips | None
+) -> dict[str, Any]:
+    """PSNR, SSIM and LPIPS of pictures [H, W, 3] in [0, 1], over the valid pixels.
+
+    For LPIPS, which looks at whole pictures, the pixels left out are the truth's in both. What
+    cannot be measured, as in a picture too small, is None, and `problem` says why.
+    """
+    same = shown if valid is None else torch.where(valid[..., None], shown, truth)
+    found: dict[str, Any] = {}
+    measures: dict[str, Callable[[], float]] = {
+        "psnr": lambda: min(psnr(shown, truth, valid), MAX_PSNR),
+        "ssim": lambda: ssim(shown, truth, valid),
+    }
+    if lpips is not None:
+        measures["lpips"] = partial(lpips.distance, same, truth)
+    for name, decimals in MEASURES.items():
+        try:
+            found[name] = round(measures[name](), decimals) if name in measures else None
+        except NerfError as error:
+            found[name], found["problem"] = None, error.message
+    return found
+
+
+def _lpips(config: EvaluateConfig, ctx: StageContext) -> tuple[Lpips | None, str | None]:
+    """The metric, or why there is none: weights that cannot be had cost LPIPS, not the job."""
+    sources = [part.strip() for part in config.lpips_weights.split(",") if part.strip()]
+    digests = [part.strip() for part in config.lpips_sha256.split(",") if part.strip()]
+    cache = Path(torch.hub.get_dir()) / "nerfworks"
+    try:
+        return lpips_if_configured(config.lpips_backbone, sources, digests, cache)
+    except NerfError as error:
+        ctx.logger.warning("no LPIPS: %s %s", error.message, error.hint)
+        return None, f"LPIPS was not measured: {error.message}"
+
+
+def _floaters(
+    scene: TrainedScene, config: EvaluateConfig, seed: int, meter: _Meter
+) -> tuple[dict[str, Any] | None, str | None]:
+    """Both measures, or why there are none."""
+    if not config.floaters:
+        return None, "Floaters were not measured: evaluate.floaters is off."
+    posed = scene.training_images()
+    lenses = [scene.lens_of(image) for image in posed]
+    renderer, model = Renderer(scene.model, scene.scene), scene.model
+    num_calls, calls = _floater_renders(config), 0
+
+    def render_rays(origins: Tensor, directions: Tensor) -> RenderedImage:
+        nonlocal calls
+        calls += 1
+        meter.show("floaters", min(calls / num_calls, 1.0), "measuring floaters")
+        return renderer.render_rays(origins, directions)
+
+    def density(positions: Tensor) -> Tensor:
+        meter.show("floaters", 1.0, "measuring floaters")
+        return model.density(positions)
+
+    try:
+        cameras = nerf_cameras(lenses, [image.world_from_camera for image in posed], scene.scene)
+        cameras = cameras.resized(config.floater_long_side_px)
+        found = floater_measures(
+            render_rays,
+            off_path_cameras(cameras, config.floater_views, seed),
+            cameras.to(next(model.parameters()).device),
+            opacity_of_density(density, near=model.config.near),
+            scene.scene.scale,
+        )
+    except NerfError as error:
+        return None, f"Floaters were not measured: {error.message}"
+    consistency = found.depth_inconsistency
+    return {
+        "depth_inconsistency": None if consistency is None else round(consistency, 6),
+        "near_mass": round(found.near_mass, 6),
+        **found.details,
+    }, None
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The content of `metrics.json` from rows of file, psnr, ssim, width, height."""
-    mean = {
-        key: round(float(np.mean([row[key] for row in rows])), 4) if rows else None
-        for key in ("psnr", "ssim")
-    }
+    """Means and rows for `metrics.json`, from what `_measure_view` gives.
+
+    A mean is over the images that have the value, and None where none has.
+    """
+    halves = [row["half_unseen"] for row in rows if "half_unseen" in row]
     sizes = [(row["width"], row["height"]) for row in rows]
     width, height = max(sizes, key=sizes.count) if sizes else (0, 0)
     return {
-        **mean,
-        "lpips": None,
-        "lpips_reason": _NO_LPIPS,
+        **_means(rows),
+        "half_unseen": _means(halves) if halves else None,
         "num_images": len(rows),
         "width": width,
         "height": height,
-        "protocol": _PROTOCOL,
-        "per_image": [{key: row[key] for key in ("file", "psnr", "ssim")} for row in rows],
+        "per_image": [
+            {key: value for key, value in row.items() if key not in ("width", "height")}
+            for row in rows
+        ],
     }
+
+
+def _means(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    means: dict[str, float | None] = {}
+    for name in MEASURES:
+        values = [row[name] for row in rows if row.get(name) is not None]
+        means[name] = round(float(np.mean(values)), 4) if values else None
+    return means
 
 
 def side_by_side(truth: NDArray[np.float32], shown: NDArray[np.float32]) -> NDArray[np.uint8]:

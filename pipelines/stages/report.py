@@ -2,8 +2,10 @@
 
 Fixed keys, for programs: capture.kind, poses.num_images, poses.num_registered,
 poses.registered_ratio, metrics.psnr, metrics.ssim, metrics.num_images, metrics.width,
-metrics.height, metrics.per_image[], timings.<stage>_s, options, versions,
-artifacts[] {name, bytes, sha256}. Everything else may grow.
+metrics.height, metrics.per_image[], metrics.protocol {name, split, fit_poses, fit_appearance,
+train_camera_optimizer, train_appearance, description}, metrics.lpips and metrics.floaters (null
+with a metrics.lpips_reason or metrics.floaters_reason where they were not measured),
+timings.<stage>_s, options, versions, artifacts[] {name, bytes, sha256}. Everything else may grow.
 
 All of it comes from the manifests of the stages before; nothing is measured here.
 """
@@ -80,10 +82,14 @@ def build_report(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]
                 "ssim",
                 "lpips",
                 "lpips_reason",
+                "lpips_backbone",
                 "num_images",
                 "width",
                 "height",
                 "protocol",
+                "half_unseen",
+                "floaters",
+                "floaters_reason",
                 "per_image",
             )
         },

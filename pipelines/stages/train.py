@@ -120,6 +120,7 @@ def _load(config: TrainConfig, ctx: StageContext) -> _Inputs:
         [_inside(root, image.file) for image in marked],
         config.data.long_side_px,
         [None if image.mask is None else _inside(root, image.mask) for image in marked],
+        max_bytes=int(config.data.max_memory_gib * 2**30),
     )
     return _Inputs(capture, cameras, images, train_indices, test_indices, scene)
 

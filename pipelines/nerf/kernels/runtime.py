@@ -69,6 +69,20 @@ def compiled(function: Callable[..., Any]) -> Any:
     return numba.njit(**_OPTIONS)(function)
 
 
+def exact(function: Callable[..., Any]) -> Any:
+    """As `compiled`, with rounding as written: for code that a reordering would break."""
+    return numba.njit(**(_OPTIONS | {"fastmath": False}))(function)
+
+
+def merged(function: Callable[..., Any]) -> Any:
+    """A step of a long kernel, compiled as a part of it.
+
+    `compiled` functions are optimised once by themselves and again in every caller, which makes
+    the first start of a kernel that is three calls deep take three times as long.
+    """
+    return numba.njit(inline="always", **_OPTIONS)(function)
+
+
 def inlined(function: Callable[..., Any]) -> Any:
     """A small function for the innermost loops, where a call would cost more than its body."""
     return numba.njit(forceinline=True, **_OPTIONS)(function)
@@ -79,17 +93,20 @@ def num_threads() -> int:
     return max(1, min(os.cpu_count() or 1, torch.get_num_threads()))
 
 
-def run_threads(kernel: Callable[..., None], *arguments: Any) -> None:
+def run_threads(kernel: Callable[..., None], *arguments: Any, shares: int | None = None) -> None:
     """Call `kernel(share, shares, *arguments)` for every share; return when all are done.
 
     There are several shares to a thread, and a thread takes the next one when it is done with one,
     so that a core that is also wanted elsewhere does less instead of keeping the others waiting. A
-    share writes what no other share writes, so results repeat whoever does it.
+    share writes what no other share writes, so results repeat whoever does it. Where shares cost
+    memory, `shares` says how many there are.
     """
     threads = num_threads()
-    shares = threads * SHARES_PER_THREAD
-    if threads == 1:
-        kernel(0, 1, *arguments)
+    if shares is None:
+        shares = 1 if threads == 1 else threads * SHARES_PER_THREAD
+    if threads == 1 or shares == 1:
+        for share in range(shares):
+            kernel(share, shares, *arguments)
         return
     waiting = iter(range(shares))  # `next` is atomic under the interpreter's lock
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from pipelines.nerf.config import NerfactoConfig
 from pipelines.nerf.encodings import HashGrid
 from pipelines.nerf.fields import DensityField, NerfactoField
-from pipelines.nerf.intervals import weights_from_density
+from pipelines.nerf.intervals import sample_pdf, weights_from_density
 from pipelines.nerf.losses import (
     color_loss,
     distortion_loss,
@@ -33,7 +33,7 @@ from pipelines.nerf.rendering import (
     expected_depth,
     median_depth,
 )
-from pipelines.nerf.samplers import anneal_exponent, sample_proposals
+from pipelines.nerf.samplers import anneal_exponent, sample_proposals, weigh_density
 
 ALWAYS_UPDATE_BEFORE = 10
 
@@ -61,6 +61,7 @@ class Nerfacto(Model):
         if config.predict_normals:
             self.normal_head = PredictedNormals(config.geo_feature_dim)
         self.steps_since_update = 0
+        self.kernels: Any = None
 
     def round_networks(self) -> list[nn.Module]:
         """The proposal network of each round, in order; the same one each time where shared."""
@@ -92,8 +93,14 @@ class Nerfacto(Model):
     def set_engine(self, engine: str) -> None:
         """As `Model.set_engine`. Learned normals need second derivatives, which only plain has."""
         super().set_engine(engine)
-        if self.normal_head is not None and isinstance(self.field.grid, HashGrid):
-            self.field.grid.engine = "plain"
+        self.kernels = None
+        if engine == "fast":
+            # Imported here: a machine that trains on a GPU never loads the compiler.
+            from pipelines.nerf.kernels import engine as kernels
+
+            self.kernels = kernels
+        if self.normal_head is not None and self.field.hash_grid is not None:
+            self.field.hash_grid.engine = "plain"
 
     def forward(
         self,
@@ -110,6 +117,7 @@ class Nerfacto(Model):
         config = self.config
         rays = self.corrected(rays)
         plan = plan or StepPlan(0)
+        kernels = self.kernels if rays.origins.device.type == "cpu" else None
         with nullcontext() if plan.update_proposals else torch.no_grad():
             final, samples, weights = sample_proposals(
                 rays,
@@ -122,12 +130,19 @@ class Nerfacto(Model):
                 exponent=plan.exponent,
                 single_jitter=config.single_jitter,
                 generator=generator,
+                weigh=kernels.weigh if kernels else weigh_density,
+                resample=kernels.resample if kernels else sample_pdf,
             )
-        points = final.positions(rays)
-        density, geometry = self.field.density(points)
-        colors = self.field.color(rays.directions, geometry, self._codes(rays, appearance))
-        found = weights_from_density(density, final.t_edges)
-        rgb = composite(colors, found, config.background, generator=generator)
+        codes = self._codes(rays, appearance)
+        points = geometry = None
+        if kernels and self.normal_head is None and kernels.knows_field(self.field):
+            rgb, found = kernels.shade(self.field, rays, final, codes, config.background, generator)
+        else:
+            points = final.positions(rays)
+            density, geometry = self.field.density(points)
+            colors = self.field.color(rays.directions, geometry, codes)
+            found = weights_from_density(density, final.t_edges)
+            rgb = composite(colors, found, config.background, generator=generator)
         with torch.no_grad():
             median = median_depth(found.detach(), final.t_edges)
             expected = expected_depth(found.detach(), final.t_edges)
@@ -139,7 +154,7 @@ class Nerfacto(Model):
             weights=[*weights, found],
             samples=[*samples, final],
         )
-        if self.normal_head is not None:
+        if points is not None and geometry is not None and self.normal_head is not None:
             self._add_normals(outputs, points, geometry, rays)
         return outputs
 
@@ -169,7 +184,9 @@ class Nerfacto(Model):
         if (plan is None or plan.update_proposals) and config.interlevel_weight > 0.0:
             edges = [samples.s_edges for samples in proposal_samples]
             pairs = list(zip(edges, proposal_weights, strict=True))
-            interlevel = interlevel_loss(final.s_edges, weights, pairs)
+            on_cpu = weights.device.type == "cpu" and self.kernels is not None
+            loss = self.kernels.interlevel_loss if on_cpu else interlevel_loss
+            interlevel = loss(final.s_edges, weights, pairs)
             losses["interlevel"] = config.interlevel_weight * interlevel
         if config.distortion_weight > 0.0:
             distortion = distortion_loss(final.s_edges, weights)

@@ -35,6 +35,14 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
     assert 0.0 < metrics["ssim"] < 1.0
     assert metrics["num_images"] == len(metrics["per_image"]) == 5
     assert (metrics["width"], metrics["height"]) == (36, 64)
+    assert metrics["protocol"]["name"] == "custom"
+    assert metrics["protocol"]["split"] == "fraction 0.9"
+    assert metrics["protocol"]["train_camera_optimizer"] == "so3xr3"
+    assert metrics["protocol"]["train_appearance"] is True
+    assert (metrics["lpips"], metrics["half_unseen"]) == (None, None)
+    assert metrics["lpips_reason"]
+    assert 0.0 <= metrics["floaters"]["near_mass"] <= 1.0
+    assert metrics["floaters_reason"] is None
     ran = {"ingest", "train", "evaluate", "pointcloud", "mesh", "video"}
     assert set(report["timings"]) == {f"{name}_s" for name in ran}
     assert all(seconds > 0 for seconds in report["timings"].values())

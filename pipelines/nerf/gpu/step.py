@@ -1,0 +1,270 @@
+"""Whole training steps without a host that waits: pixels, rays, model, losses and Adam on one GPU.
+
+The host decides what a step does (`Model.plan_step`, plain arithmetic), writes the numbers that
+change into tensors, and starts the step: the first few of each kind one kernel at a time, the rest
+as one CUDA graph per kind. Kinds are the steps with and without an update of the proposals, before
+and after the end of the annealing; graphs share one memory pool, since only one runs at a time.
+Losses stay on the GPU until they are asked for; `LossReader` brings them over behind the run.
+
+The first steps of a kind are real steps of the run, so that nothing has to be undone: they compile
+the Triton kernels, take the optimisers' state and fill the allocator, none of which a capture may
+do. Elsewhere than on a GPU, and for methods whose steps ask the device (occupancy grids), the same
+code runs without graphs.
+
+Half precision is float16 rather than bfloat16: a density is exp(logit), and at a logit of 8 one
+unit in the last place is 0.8 % of the density in float16 (11 bits), but 6 % in bfloat16 (8 bits).
+What float16 lacks is range, hence `loss_scaler`: with a loss that is a mean over R rays, the
+gradients of a ray are of the order 1 / R, and a scale of 8 R brings them to the middle of the
+range. The scale is on the device; a step whose gradients overflow is left out by Adam's kernel
+itself (its `found_inf`), and the scale is halved. None of that needs the host.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pipelines.nerf.cameras import Cameras
+from pipelines.nerf.data import PixelSampler
+from pipelines.nerf.models.base import Model, StepPlan
+from pipelines.nerf.models.nerfacto import Nerfacto
+
+EAGER_STEPS = 3
+"""Steps of each kind that run before it is captured: torch asks for at least one, three let the
+allocator and the libraries settle."""
+MAX_TERMS = 16
+SCALE_PER_RAY = 8.0
+NEVER = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class StepLosses:
+    """Weighted terms by name, as training reports them, of the step counted from 0."""
+
+    step: int
+    values: dict[str, float]
+
+
+def capturable_adam(
+    parameters: Iterable[nn.Parameter], rate: float, eps: float, device: torch.device
+) -> torch.optim.Adam:
+    """Adam whose step can be captured: its rate, its count of steps and its skips are tensors.
+
+    On a GPU one fused kernel reads each parameter, gradient and moment once. Elsewhere the same
+    optimiser with a number for its rate.
+    """
+    if device.type != "cuda":
+        return torch.optim.Adam(parameters, lr=rate, eps=eps, fused=True)
+    held = torch.tensor(rate, dtype=torch.float32, device=device)
+    return torch.optim.Adam(parameters, lr=held, eps=eps, fused=True, capturable=True)
+
+
+def loss_scale(rays_per_step: int) -> float:
+    """The power of two at or above 8 R."""
+    return 2.0 ** math.ceil(math.log2(SCALE_PER_RAY * rays_per_step))
+
+
+def loss_scaler(device: torch.device, rays_per_step: int) -> torch.amp.GradScaler:
+    """The fixed `loss_scale` of float16 on a GPU; off on a CPU.
+
+    It never grows; it is halved after a step whose gradients were not finite.
+    """
+    scale = loss_scale(rays_per_step)
+    on_gpu = device.type == "cuda"
+    return torch.amp.GradScaler(device.type, scale, growth_interval=NEVER, enabled=on_gpu)
+
+
+def can_capture(model: Model, device: torch.device) -> bool:
+    """Whether the steps of a model can be CUDA graphs: on a GPU, and of a method without host."""
+    return device.type == "cuda" and isinstance(model, Nerfacto)
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What distinguishes one graph from another."""
+
+    update_proposals: bool
+    annealing: bool
+
+
+class TrainingStep:
+    """Runs training steps of one model.
+
+    model: in `train()`, on the device of the cameras. optimizers: by name, as `capturable_adam`
+    makes them. scaler: as `loss_scaler`; any other is read by the host unless its optimisers are
+    fused. sampler: holds the pixels on the device, or on the CPU, from where 28 bytes a ray follow
+    each step. cameras: of the training images, on the device. pixel_random: of the sampler's
+    device; model_random: of the model's.
+    capture: None for graphs where `can_capture`, False for none.
+
+    States are restored (checkpoints) before the first step: graphs hold the tensors they were
+    captured with.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        optimizers: Mapping[str, torch.optim.Adam],
+        scaler: torch.amp.GradScaler,
+        sampler: PixelSampler,
+        cameras: Cameras,
+        rays_per_step: int,
+        *,
+        pixel_random: torch.Generator,
+        model_random: torch.Generator,
+        capture: bool | None = None,
+    ) -> None:
+        self._model, self.optimizers, self._scaler = model, dict(optimizers), scaler
+        self._sampler, self._cameras, self._rays_per_step = sampler, cameras, rays_per_step
+        self._pixel_random, self._model_random = pixel_random, model_random
+        self.device = cameras.focal.device
+        self.captures = can_capture(model, self.device) and capture is not False
+        on_gpu = self.device.type == "cuda"
+        self._stream = torch.cuda.Stream(self.device) if on_gpu else None  # type: ignore[no-untyped-call]
+        self._fed: tuple[Tensor, Tensor, Tensor] | None = None
+        if sampler.device.type != self.device.type:
+            self._fed = (
+                torch.zeros(rays_per_step, dtype=torch.int64, device=self.device),
+                torch.zeros(rays_per_step, 2, device=self.device),
+                torch.zeros(rays_per_step, 3, device=self.device),
+            )
+        self._exponent = torch.ones((), dtype=torch.float32, device=self.device)
+        self._values = torch.zeros(MAX_TERMS, dtype=torch.float32, device=self.device)
+        self._names: dict[_Kind, tuple[str, ...]] = {}
+        self._runs: dict[_Kind, int] = {}
+        self._graphs: dict[_Kind, torch.cuda.CUDAGraph] = {}
+        self._latest: tuple[int, tuple[str, ...]] = (-1, ())
+
+    def run(self, step: int, rates: Mapping[str, float]) -> None:
+        """One step, counted from 0; returns when it was started.
+
+        rates: the learning rate of each optimiser, by its name.
+        """
+        self._set_rates(rates)
+        plan = self._model.plan_step(step, self._model_random)
+        kind = _Kind(plan.update_proposals, plan.exponent != 1.0)
+        if self._stream is None:
+            self._run_as(kind, plan)
+        else:
+            before = torch.cuda.current_stream(self.device)
+            self._stream.wait_stream(before)
+            with torch.cuda.stream(self._stream):
+                self._run_as(kind, plan)
+            before.wait_stream(self._stream)
+        self._latest = (step, self._names[kind])
+        self._model.finish_step(plan)
+
+    def _run_as(self, kind: _Kind, plan: StepPlan) -> None:
+        if self._fed is not None:
+            drawn = self._sampler.draw(self._rays_per_step, self._pixel_random)
+            for held, item in zip(self._fed, drawn, strict=True):
+                # From pinned memory, which the allocator keeps until the copy is done.
+                held.copy_(item.pin_memory(), non_blocking=True)
+        if not self.captures:
+            self._optimise(kind, plan)
+            return
+        self._exponent.fill_(plan.exponent)
+        runs = self._runs[kind] = self._runs.get(kind, 0) + 1
+        if runs <= EAGER_STEPS:
+            self._optimise(kind, self._with_held_exponent(kind, plan))
+            return
+        if kind not in self._graphs:
+            self._graphs[kind] = self._captured(kind, self._with_held_exponent(kind, plan))
+        self._graphs[kind].replay()
+
+    def _with_held_exponent(self, kind: _Kind, plan: StepPlan) -> StepPlan:
+        """The plan with a tensor for what differs from step to step of a kind."""
+        held: Any = self._exponent
+        return replace(plan, exponent=held) if kind.annealing else plan
+
+    def _captured(self, kind: _Kind, plan: StepPlan) -> torch.cuda.CUDAGraph:
+        """The step as a graph; capturing runs nothing."""
+        graph = torch.cuda.CUDAGraph()
+        for generator in (self._pixel_random, self._model_random):
+            if generator.device.type == "cuda":
+                graph.register_generator_state(generator)
+        pool = next(iter(self._graphs.values())).pool() if self._graphs else None
+        torch.cuda.synchronize(self.device)
+        # Other threads of the process may go on using the GPU meanwhile.
+        with torch.cuda.graph(
+            graph, pool=pool, stream=self._stream, capture_error_mode="thread_local"
+        ):
+            self._optimise(kind, plan)
+        return graph
+
+    def _optimise(self, kind: _Kind, plan: StepPlan) -> None:
+        """The step itself: only work on the device, nothing that the host has to wait for."""
+        model, device = self._model, self.device
+        drawn = self._fed or self._sampler.draw(self._rays_per_step, self._pixel_random)
+        index, pixels, colors = drawn
+        rays = self._cameras.generate_rays(index, pixels)
+        half = device.type == "cuda"
+        # A cache of half-precision weights would outlive the graph that it was made in.
+        with torch.autocast(device.type, torch.float16, enabled=half, cache_enabled=False):
+            outputs = model(rays, plan=plan, generator=self._model_random)
+            losses = model.loss_dict(outputs, colors, plan=plan)
+        terms = torch.stack([loss.float() for loss in losses.values()])
+        self._values[: len(losses)].copy_(terms.detach())
+        self._names[kind] = tuple(losses)
+        for parameter in model.parameters():
+            parameter.grad = None  # Adam leaves alone what has no gradient
+        total = torch.stack(list(losses.values())).sum()
+        torch.autograd.backward(self._scaler.scale(total))
+        for optimizer in self.optimizers.values():
+            self._scaler.step(optimizer)
+        self._scaler.update()
+
+    def _set_rates(self, rates: Mapping[str, float]) -> None:
+        """Rates that are tensors are filled in place, which a captured step sees."""
+        for name, optimizer in self.optimizers.items():
+            for group in optimizer.param_groups:
+                if isinstance(group["lr"], Tensor):
+                    group["lr"].fill_(rates[name])
+                else:
+                    group["lr"] = rates[name]
+
+    def losses(self) -> StepLosses:
+        """The terms of the last step; waits for the GPU."""
+        step, names = self._latest
+        return StepLosses(step, dict(zip(names, self._values.tolist(), strict=False)))
+
+    def pending(self) -> tuple[int, tuple[str, ...], Tensor]:
+        """(step, names, values on the device) of the last step, for `LossReader`."""
+        return (*self._latest, self._values)
+
+
+class LossReader:
+    """Brings losses to the host behind the run: what is sent now is there a few steps later."""
+
+    def __init__(self, device: torch.device) -> None:
+        on_gpu = device.type == "cuda"
+        self._host = torch.zeros(MAX_TERMS, dtype=torch.float32, pin_memory=on_gpu)
+        self._arrived = torch.cuda.Event() if on_gpu else None  # type: ignore[no-untyped-call]
+        self._sent: tuple[int, tuple[str, ...]] | None = None
+
+    def send(self, step: TrainingStep) -> None:
+        """Start to copy the losses of the last step. What was sent before must have been taken."""
+        number, names, values = step.pending()
+        self._host.copy_(values, non_blocking=True)
+        if self._arrived is not None:
+            self._arrived.record(torch.cuda.current_stream(step.device))
+        self._sent = (number, names)
+
+    def take(self) -> StepLosses | None:
+        """What was sent, or None before anything was.
+
+        Waits for that copy alone, which bounds how far the host runs ahead of the GPU; sent n steps
+        ago, it is there as a rule.
+        """
+        if self._sent is None:
+            return None
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        step, names = self._sent
+        self._sent = None
+        return StepLosses(step, dict(zip(names, self._host.tolist(), strict=False)))

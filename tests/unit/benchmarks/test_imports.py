@@ -1,0 +1,29 @@
+"""The benchmarks run on a bare GPU machine: what they import, and what pytest makes of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests import benchmarks
+from tests.test_architecture import NERF_MAY_IMPORT, imports_of, within
+
+FOLDER = Path(benchmarks.__file__).parent
+
+# Presets are pydantic's: asked for only where a preset is, with an error that says so.
+ONLY_FOR_PRESETS = ("settings.py", "pipelines.options.PRESETS")
+
+
+def test_benchmarks_import_only_what_a_bare_machine_has() -> None:
+    wrong = []
+    for path in FOLDER.glob("*.py"):
+        for line, name in imports_of(path):
+            ours = within(name, ("pipelines.nerf", "tests.benchmarks"))
+            if ours or name.split(".")[0] in NERF_MAY_IMPORT:
+                continue
+            if (path.name, name) != ONLY_FOR_PRESETS:
+                wrong.append(f"{path.name}:{line} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_benchmarks_are_not_collected_as_tests() -> None:
+    assert not [path.name for path in FOLDER.glob("*.py") if path.stem.startswith("test_")]
