@@ -39,7 +39,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="train",
-        version=1,
+        version=2,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.train:run",
@@ -58,7 +58,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="evaluate",
-        version=1,
+        version=2,
         after=("train",),
         reads=("ingest", "frames", "train"),
         run="pipelines.stages.evaluate:run",

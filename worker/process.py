@@ -21,7 +21,7 @@ from worker.stage_process import END_OF_LOG
 _log = logging.getLogger("nerfworks.worker")
 _SECRET_NAME = re.compile(
     r"^(AWS|AZURE|GOOGLE|GCP|GCLOUD|S3|CELERY|PG)_?"
-    r"|^NERFWORKS_(?!HOME$|REGISTRY$)"
+    r"|^NERFWORKS_(?!HOME$|REGISTRY$|LPIPS_(WEIGHTS|SHA256)$)"
     r"|SECRET|PASSWORD|TOKEN|CREDENTIAL|API_?KEY|ACCESS_?KEY|DATABASE_URL|REDIS_URL"
 )
 _LINE_BYTES = 8_192

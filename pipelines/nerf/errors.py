@@ -7,7 +7,8 @@ class NerfError(Exception):
     """A failure that a person can act on.
 
     code: stable identifier, snake_case. Codes in use: bad_config, bad_cameras, bad_image,
-        too_few_images, non_finite_loss, bad_checkpoint, bad_model_file.
+        bad_rays, bad_plugin, too_few_images, too_much_memory, non_finite_loss, bad_checkpoint,
+        bad_model_file, lpips_weights.
     message: what failed and on what, one sentence without paths of this machine.
     hint: what to do about it, one sentence.
     """

@@ -47,8 +47,6 @@ class EvaluateConfig:
         default_factory=TestTimeConfig, metadata={"help": "How those fits are done."}
     )
     lpips_backbone: str = option("alex", "Network of LPIPS.", choices=("alex", "vgg"))
-    lpips_weights: str = option("", "File or URL of its weights; empty for no LPIPS.")
-    lpips_sha256: str = option("", "SHA-256 of that file.")
     floaters: bool = option(True, "Measure floaters on renders off the path.")
     floater_views: int = option(4, "Off-path views rendered for it.", ge=2, le=1000)
     floater_long_side_px: int = option(64, "Long side of those renders.", unit="px", ge=16, le=4096)

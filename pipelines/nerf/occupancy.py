@@ -22,8 +22,8 @@ DensityFunction = Callable[[Tensor], Tensor]
 
 SCENE_DIAGONAL = 2.0 * math.sqrt(3.0)
 """Of [-1, 1]^3, scene units."""
-POINTS_PER_UPDATE = 2**18
-"""Cells whose density is asked for at once."""
+POINTS_PER_UPDATE = {"cpu": 2**16, "cuda": 2**19}
+"""Cells whose density is asked for at once, by kind of device."""
 CANDIDATES_PER_CHUNK = {"cpu": 2**18, "cuda": 2**24}
 """Intervals that are looked up at once, by kind of device."""
 LOWEST_THRESHOLD = 1e-6
@@ -34,8 +34,10 @@ class OccupancyGrid(nn.Module):
     """Which cells hold matter; state that is saved with the model.
 
     resolution: N. num_cascades: C. decay: share of a cell's density that is left at an update.
-    threshold: density per scene unit above which a cell is full; where the mean of all cells is
-        lower, that. A new grid is full everywhere.
+    threshold: density per scene unit above which a cell of the first cascade is full; where the
+        mean of all cells is lower, that. Cascade c takes 2^-c of it, since cells and steps are
+        longer there: by one limit for all, what is far and thin would be lost for good.
+        A new grid is full everywhere.
     density: [C, N^3], largest recent density of each cell, x slowest. occupied: [C, N^3] bool.
     mean_density: [], over all cells; 0 in a new grid.
     """
@@ -99,8 +101,9 @@ class OccupancyGrid(nn.Module):
         known = self.density.view(-1)
         known.mul_(self.decay)
         count = total if rows is None else len(rows)
-        for begin in range(0, count, POINTS_PER_UPDATE):
-            end = min(begin + POINTS_PER_UPDATE, count)
+        tile = POINTS_PER_UPDATE.get(known.device.type, POINTS_PER_UPDATE["cpu"])
+        for begin in range(0, count, tile):
+            end = min(begin + tile, count)
             if rows is None:
                 chosen = torch.arange(begin, end, device=known.device)
             else:
@@ -110,7 +113,8 @@ class OccupancyGrid(nn.Module):
             known.scatter_reduce_(0, chosen, found, "amax")
         self.mean_density.copy_(self.density.mean())
         limit = self.mean_density.clamp(LOWEST_THRESHOLD, max(self.threshold, LOWEST_THRESHOLD))
-        self.occupied.copy_(self.density > limit)
+        widths = torch.exp2(torch.arange(self.num_cascades, device=limit.device))[:, None]
+        self.occupied.copy_(self.density > limit / widths)
 
     def _drawn_rows(self, generator: torch.Generator | None) -> Tensor:
         total, device = self.occupied.numel(), self.occupied.device

@@ -10,6 +10,7 @@ mask leaves out are not measured. `protocol` says which of this was done. Writes
 from __future__ import annotations
 
 import json
+import os
 import re
 import time
 from collections.abc import Callable
@@ -48,6 +49,8 @@ from pipelines.options import StageOptions, evaluate_config
 from pipelines.stage import StageContext
 from pipelines.trained_scene import TrainedScene, as_uint8, nerf_cameras, nerf_errors_as
 
+LPIPS_WEIGHTS, LPIPS_SHA256 = "NERFWORKS_LPIPS_WEIGHTS", "NERFWORKS_LPIPS_SHA256"
+"""Environment: a file or URL, or several with commas between, and their sums."""
 MEASURES = {"psnr": 4, "ssim": 5, "lpips": 5}
 """What is measured, and the decimals kept."""
 MAX_PSNR = 100.0
@@ -299,9 +302,15 @@ def measure(
 
 
 def _lpips(config: EvaluateConfig, ctx: StageContext) -> tuple[Lpips | None, str | None]:
-    """The metric, or why there is none: weights that cannot be had cost LPIPS, not the job."""
-    sources = [part.strip() for part in config.lpips_weights.split(",") if part.strip()]
-    digests = [part.strip() for part in config.lpips_sha256.split(",") if part.strip()]
+    """The metric, or why there is none: weights that cannot be had cost LPIPS, not the job.
+
+    Where the weights lie is set by who runs the worker, not by who sends a job, who could make it
+    read any file or address.
+    """
+    sources, digests = (
+        [part.strip() for part in os.environ.get(name, "").split(",") if part.strip()]
+        for name in (LPIPS_WEIGHTS, LPIPS_SHA256)
+    )
     cache = Path(torch.hub.get_dir()) / "nerfworks"
     try:
         return lpips_if_configured(config.lpips_backbone, sources, digests, cache)

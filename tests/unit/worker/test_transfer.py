@@ -198,6 +198,8 @@ def test_a_stage_process_sees_no_keys_of_the_service() -> None:
     environment = {
         "PATH": "/bin",
         "NERFWORKS_HOME": "/h",
+        "NERFWORKS_LPIPS_WEIGHTS": "/w",
+        "NERFWORKS_LPIPS_SHA256": "0",
         "NERFWORKS_DATABASE_URL": "postgresql://u:p@h/d",
         "NERFWORKS_REDIS_URL": "redis://:p@h",
         "NERFWORKS_S3_SECRET_ACCESS_KEY": "s",
@@ -210,6 +212,8 @@ def test_a_stage_process_sees_no_keys_of_the_service() -> None:
     assert set(kept) == {
         "PATH",
         "NERFWORKS_HOME",
+        "NERFWORKS_LPIPS_SHA256",
+        "NERFWORKS_LPIPS_WEIGHTS",
         "OMP_NUM_THREADS",
         "OMP_WAIT_POLICY",
         "PYTHONPATH",

@@ -20,7 +20,14 @@ from pipelines.manifest import RunHooks
 from pipelines.nerf.checkpoint import load_model, save_model
 from pipelines.nerf.lpips import Lpips
 from pipelines.nerf.metrics import psnr, ssim
-from pipelines.stages.evaluate import measure, picture_name, side_by_side, summarise
+from pipelines.stages.evaluate import (
+    LPIPS_SHA256,
+    LPIPS_WEIGHTS,
+    measure,
+    picture_name,
+    side_by_side,
+    summarise,
+)
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -209,10 +216,13 @@ def _write_weights(folder: Path) -> tuple[Path, str, Lpips]:
     return path, hashlib.sha256(path.read_bytes()).hexdigest(), metric
 
 
-def test_lpips_is_measured_with_the_configured_weights(job: Workspace, tmp_path: Path) -> None:
+def test_lpips_is_measured_with_the_configured_weights(
+    job: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, sha256, metric = _write_weights(tmp_path)
-    options = {"max_images": 1, "floaters": False, "lpips_weights": str(path)}
-    metrics = tiny_job.run(job, "evaluate", **options, lpips_sha256=sha256)["summary"]
+    monkeypatch.setenv(LPIPS_WEIGHTS, str(path))
+    monkeypatch.setenv(LPIPS_SHA256, sha256)
+    metrics = tiny_job.run(job, "evaluate", max_images=1, floaters=False)["summary"]
     assert metrics["lpips_reason"] is None
     assert metrics["lpips_backbone"] == "alex"
     (row,) = metrics["per_image"]
@@ -224,11 +234,12 @@ def test_lpips_is_measured_with_the_configured_weights(job: Workspace, tmp_path:
 
 
 def test_weights_that_cannot_be_had_cost_lpips_and_not_the_job(
-    job: Workspace, tmp_path: Path
+    job: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, _, _ = _write_weights(tmp_path)
-    options = {"max_images": 1, "floaters": False, "lpips_weights": str(path)}
-    metrics = tiny_job.run(job, "evaluate", **options, lpips_sha256="0" * 64)["summary"]
+    monkeypatch.setenv(LPIPS_WEIGHTS, str(path))
+    monkeypatch.setenv(LPIPS_SHA256, "0" * 64)
+    metrics = tiny_job.run(job, "evaluate", max_images=1, floaters=False)["summary"]
     assert metrics["lpips"] is None
     assert metrics["per_image"][0]["lpips"] is None
     assert "sha256" in metrics["lpips_reason"]
