@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Annotated, Any, Union
 
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
@@ -12,7 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from api.deps import ServicesDep
 from api.errors import responses
 from api.jobs.service import default_preset
-from pipelines.options import PRESETS, STAGE_OPTIONS, resolve_options
+from pipelines.options import (
+    PRESETS,
+    STAGE_OPTIONS,
+    method_names,
+    resolve_options,
+    train_options,
+)
 
 router = APIRouter(prefix="/v1", tags=["catalogue"])
 page_router = APIRouter(include_in_schema=False)
@@ -64,6 +70,11 @@ def options_schema() -> dict[str, Any]:
         stage: (model, Field(default_factory=model, description=(model.__doc__ or "").strip()))
         for stage, model in STAGE_OPTIONS.items()
     }
+    of_any_method: Any = Union[tuple(train_options(name) for name in method_names())]  # noqa: UP007
+    fields["train"] = (
+        Annotated[of_any_method, Field(discriminator="method")],
+        Field(default_factory=STAGE_OPTIONS["train"], description=STAGE_OPTIONS["train"].__doc__),
+    )
     whole = create_model("Options", __config__=ConfigDict(extra="forbid"), **fields)
     schema = whole.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"

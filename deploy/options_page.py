@@ -6,8 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipelines.options import PRESETS, STAGE_OPTIONS
+from pipelines.options import PRESETS, STAGE_OPTIONS, method_names, train_options
 
+TABLE_HEAD = ("| option | default | allowed | meaning |", "|---|---|---|---|")
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "options.md"
 
 
@@ -33,6 +34,19 @@ def rows(prefix: str, schema: dict[str, Any], definitions: dict[str, Any]) -> li
     return lines
 
 
+def other_methods(known: list[str]) -> list[str]:
+    """What `train` has for methods other than the default one; `known`: the rows of that."""
+    parts = []
+    for name in method_names():
+        options = train_options(name)
+        schema = options.model_json_schema()
+        own = [row for row in rows("train", schema, schema.get("$defs", {})) if row not in known]
+        if own:
+            parts += [f"\n### train, where `method` is `{name}`\n"]
+            parts += ["As above, except:\n", *TABLE_HEAD, *own]
+    return parts
+
+
 def page() -> str:
     """The whole page."""
     parts = [
@@ -53,7 +67,9 @@ def page() -> str:
         parts += [f"\n## {stage}\n", (model.__doc__ or "").strip() + "\n"]
         table = rows(stage, schema, schema.get("$defs", {}))
         if table:
-            parts += ["| option | default | allowed | meaning |", "|---|---|---|---|", *table]
+            parts += [*TABLE_HEAD, *table]
+        if stage == "train":
+            parts += other_methods(table)
     return "\n".join(parts) + "\n"
 
 

@@ -26,6 +26,7 @@ from pipelines.nerf.config import (
 )
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.evaluation_config import EvaluateConfig
+from pipelines.nerf.plugins import Method
 from pipelines.registry import STAGE_NAMES
 
 
@@ -157,8 +158,13 @@ class ReportOptions(StageOptions):
     """The report has no options."""
 
 
-def _field_of(annotation: Any, field: dataclasses.Field[Any]) -> tuple[Any, Any]:
-    """A dataclass field as pydantic wants it: (annotation, FieldInfo)."""
+def _field_of(
+    annotation: Any, field: dataclasses.Field[Any], default: Any = None
+) -> tuple[Any, Any]:
+    """A dataclass field as pydantic wants it: (annotation, FieldInfo).
+
+    default: plain, in place of the field's own.
+    """
     meta = dict(field.metadata)
     description = meta.get("help", "")
     if "unit" in meta:
@@ -175,9 +181,9 @@ def _field_of(annotation: Any, field: dataclasses.Field[Any]) -> tuple[Any, Any]
         bounds = {}
     elif dataclasses.is_dataclass(annotation):
         annotation = _model_of(annotation)
-    if field.default_factory is not dataclasses.MISSING:
-        made = field.default_factory()
-        default: Any = _plain(made)
+    if default is None and field.default_factory is not dataclasses.MISSING:
+        default = _plain(field.default_factory())
+    if default is not None:
         return annotation, Field(default_factory=lambda: default, description=description, **bounds)
     return annotation, Field(default=field.default, description=description, **bounds)
 
@@ -191,39 +197,56 @@ def _plain(value: Any) -> Any:
     return value
 
 
-_MODELS: dict[tuple[type, type | None], type[StageOptions]] = {}
+_MODELS: dict[tuple[type, str], type[StageOptions]] = {}
 
 
-def _model_of(cls: Any, model: Any = None) -> type[StageOptions]:
+def _model_of(cls: Any, method: Method | None = None) -> type[StageOptions]:
     """The pydantic model with the fields, defaults and bounds of a dataclass.
 
-    model: for `TrainConfig`, the class of the method's own options.
+    method: for `TrainConfig`, whose own options its `model` holds.
     """
-    if (cls, model) not in _MODELS:
+    key = (cls, "" if method is None else method.name)
+    if key not in _MODELS:
+        name = cls.__name__.replace("Config", "Options")
         hints = typing.get_type_hints(cls)
         fields: dict[str, Any] = {
             field.name: _field_of(hints[field.name], field) for field in dataclasses.fields(cls)
         }
-        if model is not None:
-            fields["method"] = (Literal[tuple(methods())], fields["method"][1])
-            made = _plain(model())
-            fields["model"] = (
-                _model_of(model),
-                Field(default_factory=lambda: made, description="The model's options."),
-            )
-        _MODELS[cls, model] = create_model(
-            cls.__name__.replace("Config", "Options"),
-            __base__=StageOptions,
-            __doc__=cls.__doc__,
-            **fields,
-        )
-    return _MODELS[cls, model]
+        if method is not None:
+            name += "".join(part.title() for part in method.name.split("-"))
+            fields |= _fields_of_method(method)
+        _MODELS[key] = create_model(name, __base__=StageOptions, __doc__=cls.__doc__, **fields)
+    return _MODELS[key]
+
+
+def _fields_of_method(method: Method) -> dict[str, Any]:
+    """The fields of `TrainConfig` in which one method differs from another."""
+    defaults = default_train_config(method.name)
+    fields: dict[str, Any] = {
+        "method": (Literal[method.name], Field(method.name, description=method.summary)),
+        "model": (
+            _model_of(method.config),
+            Field(
+                default_factory=lambda: _plain(defaults.model), description="The model's options."
+            ),
+        ),
+    }
+    for name in method.train:
+        item = next(field for field in dataclasses.fields(TrainConfig) if field.name == name)
+        value = _plain(getattr(defaults, name))
+        fields[name] = _field_of(typing.get_type_hints(TrainConfig)[name], item, value)
+    return fields
+
+
+def method_names() -> tuple[str, ...]:
+    """What `train.method` may be, plugins' methods included."""
+    return tuple(methods())
 
 
 def train_options(method: str) -> type[StageOptions]:
     """`TrainConfig` with the options of a method, checked. Raises OptionsError for no method."""
     try:
-        return _model_of(TrainConfig, find_method(method).config)
+        return _model_of(TrainConfig, find_method(method))
     except NerfError as error:
         raise OptionsError([("train.method", error.message)]) from error
 
@@ -389,9 +412,9 @@ def _train_ground(
     Presets are made for Nerfacto; of their training options another method takes those that are
     not about the model and its optimiser.
     """
-    method = given.get("method", NERFACTO.name)
-    model = train_options(str(method))
-    base = model.model_validate(_plain(default_train_config(method))).model_dump(mode="json")
+    method = str(given.get("method", NERFACTO.name))
+    model = train_options(method)
+    base = model().model_dump(mode="json")
     if method != NERFACTO.name:
         wanted = {key: value for key, value in wanted.items() if key not in ("model", "optimizer")}
     return model, base, wanted

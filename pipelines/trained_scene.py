@@ -26,7 +26,7 @@ from pipelines.nerf.checkpoint import load_model
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Appearance, Model
 from pipelines.nerf.renderer import RenderedImage, Renderer
-from pipelines.nerf.training import choose_device
+from pipelines.nerf.training_state import choose_device
 from pipelines.scene_bounds import SceneBounds, scene_bounds
 
 Floats = NDArray[np.float64]

@@ -236,8 +236,7 @@ class Cameras:
         """
         pose = self.scene_from_camera[camera_indices]
         local = (pose[:, :, :3].transpose(1, 2) @ (points - pose[:, :, 3])[..., None]).squeeze(-1)
-        # OpenCV's axes, in which lens formulas are written: y down, z forward.
-        local = local * torch.tensor([1.0, -1.0, -1.0], dtype=local.dtype, device=local.device)
+        local = _flipped(local)
         terms, model = self.distortion[camera_indices], self.model[camera_indices]
         plane = distort(local, terms, model, self.kinds)
         return plane * self.focal[camera_indices] + self.principal[camera_indices], local[:, 2]
@@ -250,9 +249,15 @@ class Cameras:
             local = undistort(plane, terms, model, self.kinds)
         else:
             local = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=-1)
-        local = local * torch.tensor([1.0, -1.0, -1.0], dtype=local.dtype, device=local.device)
+        local = _flipped(local)
         turned = (self.scene_from_camera[camera_indices, :, :3] @ local[..., None]).squeeze(-1)
         return torch.nn.functional.normalize(turned, dim=-1)
+
+
+def _flipped(local: Tensor) -> Tensor:
+    """OpenGL's axes [..., 3] to OpenCV's, in which lens formulas are written, and back."""
+    x, y, z = local.unbind(-1)
+    return torch.stack([x, -y, -z], dim=-1)
 
 
 def _require(condition: bool, problem: str) -> None:

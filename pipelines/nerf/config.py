@@ -119,6 +119,10 @@ class NerfactoConfig(ModelConfig):
     hidden_dim_color: int = option(64, "Width of the colour MLP.", ge=1, le=1024)
     geo_feature_dim: int = option(15, "Features from density to colour.", ge=1, le=256)
     appearance_dim: int = option(32, "Size of the per-image code; 0 for none.", ge=0, le=256)
+    # The reference has none: there, no ray of training ever saw the mean code that renders use.
+    appearance_dropout: float = option(
+        0.25, "Share of training rays that see the mean code, as renders do.", ge=0.0, le=1.0
+    )
     contraction: str = contraction_option()
     average_init_density: float = option(0.01, "Scale of density at the start.", ge=1e-6, le=1e3)
     single_jitter: bool = option(True, "One random offset per ray instead of one per sample.")
@@ -244,7 +248,8 @@ BUILT_IN_METHODS = (NERFACTO, INSTANT_NGP, NERF)
 
 def methods() -> dict[str, Method]:
     """Every method by name, the built-in ones first. Raises NerfError `bad_plugin`."""
-    return {method.name: method for method in BUILT_IN_METHODS} | plugin_methods()
+    built_in = {method.name: method for method in BUILT_IN_METHODS}
+    return built_in | plugin_methods(built_in)
 
 
 def find_method(name: str) -> Method:

@@ -20,8 +20,9 @@ def option(default: Any, help: str, **bounds: Any) -> Any:
 
 def allowed_names(metadata: Mapping[str, Any]) -> tuple[str, ...]:
     """The names an option may have, those of plugins included; empty where any value may be."""
-    extra = plugin_components(metadata["plugins"]) if "plugins" in metadata else {}
-    return (*metadata.get("choices", ()), *extra)
+    choices = metadata.get("choices", ())
+    extra = plugin_components(metadata["plugins"], choices) if "plugins" in metadata else {}
+    return (*choices, *extra)
 
 
 def spacing_option() -> Any:

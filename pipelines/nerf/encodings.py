@@ -9,6 +9,7 @@ in README.md. Points arrive in unit space, [0, 1]^3; bounding the world is left 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -105,10 +106,10 @@ class HashGrid(nn.Module):
 
     table: [E, F] parameter, uniform in [-1e-3, 1e-3] at the start.
     engine: "plain" for the PyTorch definition; "fast" uses the compiled twin where there is one
-    for the table (float32 on the CPU) and the plain definition elsewhere. The twin has no second
-    derivatives: a loss on normals of the density in training needs "plain", and a backward pass
-    through the twin with `create_graph` raises NerfError `bad_config`. Normals for pictures and
-    exports take one derivative, which both engines have.
+    for the table (float32, on the CPU or a CUDA GPU) and the plain definition elsewhere. The twin
+    has no second derivatives: a loss on normals of the density in training needs "plain", and a
+    backward pass through the twin with `create_graph` raises NerfError `bad_config`. Normals for
+    pictures and exports take one derivative, which both engines have.
     """
 
     resolutions: Tensor
@@ -134,16 +135,29 @@ class HashGrid(nn.Module):
     def forward(self, unit_points: Tensor) -> Tensor:
         """Features [..., L * F] at points [..., 3] in [0, 1]^3."""
         levels = (self.resolutions, self.dense, self.offsets)
-        on_cpu = self.table.device.type == "cpu" and unit_points.device.type == "cpu"
-        if self.engine == "fast" and on_cpu and self.table.dtype == torch.float32:
-            # Imported here: a machine that only uses the plain definition never loads the compiler.
+        encode = self._compiled_twin(unit_points)
+        if encode is None:
+            return hash_encode(unit_points, self.table, *levels)
+        encoded = encode(unit_points, self.table, *levels)
+        if encoded.requires_grad:
+            encoded.register_hook(_refuse_second_derivatives)  # type: ignore[no-untyped-call]
+        return encoded
+
+    def _compiled_twin(self, unit_points: Tensor) -> Callable[..., Tensor] | None:
+        """The kernel for where table and points are, if the engine wants one and there is one."""
+        where = {self.table.device.type, unit_points.device.type}
+        if self.engine != "fast" or self.table.dtype != torch.float32:
+            return None
+        # Imported here: a machine that only uses the plain definition never loads a compiler.
+        if where == {"cpu"}:
             from pipelines.nerf.kernels.hash_grid import hash_encode_fast
 
-            encoded = hash_encode_fast(unit_points, self.table, *levels)
-            if encoded.requires_grad:
-                encoded.register_hook(_refuse_second_derivatives)  # type: ignore[no-untyped-call]
-            return encoded
-        return hash_encode(unit_points, self.table, *levels)
+            return hash_encode_fast
+        if where == {"cuda"}:
+            from pipelines.nerf.gpu.hash_grid import hash_encode_triton
+
+            return hash_encode_triton
+        return None
 
 
 def _refuse_second_derivatives(gradient: Tensor) -> None:

@@ -22,6 +22,8 @@ from pipelines.nerf.plugins import plugin_components
 from pipelines.nerf.tensor_grids import CPEncoding, VMEncoding, VoxelGrid
 
 GRADIENT_CLAMP = 15.0
+APPEARANCE_INIT = 0.01
+"""Spread of the codes at the start: images differ where the data asks for it, not by chance."""
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 10, 4
 """Waves of the Fourier encodings. Source: NeRF, arXiv:2003.08934, section 5.1."""
 
@@ -149,6 +151,7 @@ class NerfactoField(nn.Module):
         self.appearance: nn.Embedding | None = None
         if config.appearance_dim:
             self.appearance = nn.Embedding(num_images, config.appearance_dim)
+            nn.init.normal_(self.appearance.weight, std=APPEARANCE_INIT)
 
     @property
     def hash_grid(self) -> HashGrid | None:

@@ -96,12 +96,31 @@ def forget_plugins() -> None:
     _found.cache_clear()
 
 
-def plugin_methods() -> dict[str, Method]:
-    """Methods of other packages by name. Raises NerfError `bad_plugin`."""
-    return {item.name: item for item in _found() if isinstance(item, Method)}
+def plugin_methods(taken: Iterable[str] = ()) -> dict[str, Method]:
+    """Methods of other packages by name.
+
+    taken: names that they may not have. Raises NerfError `bad_plugin`, for a name that is taken
+    twice too.
+    """
+    offered = [(item.name, item) for item in _found() if isinstance(item, Method)]
+    return _by_name("method", offered, taken)
 
 
-def plugin_components(kind: str) -> dict[str, Any]:
-    """Parts of one kind of other packages by name. Raises NerfError `bad_plugin`."""
-    parts = (item for item in _found() if isinstance(item, Component))
-    return {item.name: item.part for item in parts if item.kind == kind}
+def plugin_components(kind: str, taken: Iterable[str] = ()) -> dict[str, Any]:
+    """Parts of one kind of other packages by name; as `plugin_methods`."""
+    parts = (item for item in _found() if isinstance(item, Component) and item.kind == kind)
+    return _by_name(kind, [(item.name, item.part) for item in parts], taken)
+
+
+def _by_name(kind: str, offered: list[tuple[str, Any]], taken: Iterable[str]) -> dict[str, Any]:
+    known, found = set(taken), {}
+    for name, item in offered:
+        if name in known:
+            raise NerfError(
+                "bad_plugin",
+                f"Several packages offer the {kind} {name}, or it is built in.",
+                f"Uninstall one of the packages with entry points in {GROUP}.",
+            )
+        known.add(name)
+        found[name] = item
+    return found

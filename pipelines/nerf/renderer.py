@@ -88,12 +88,8 @@ class Renderer:
             raise NerfError(
                 "bad_config", f"There is no engine {engine}.", "Use auto, plain or fast."
             )
-        is_fast = (
-            engine != "plain"
-            and self._device.type == "cpu"
-            and not normals
-            and _kernel_knows(model)
-        )
+        on_cpu = self._device.type == "cpu"
+        is_fast = engine != "plain" and on_cpu and not normals and _kernel_knows(model)
         if engine == "fast" and not is_fast:
             raise NerfError(
                 "bad_config",
@@ -102,6 +98,8 @@ class Renderer:
                 "Use engine auto.",
             )
         self.engine = "fast" if is_fast else "plain"
+        if engine != "plain" and on_cpu and not is_fast:
+            model.set_engine("fast")  # its grids, where the whole model has no kernel
 
     def render(
         self,

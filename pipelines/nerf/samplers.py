@@ -91,7 +91,7 @@ def sample_proposals(
     far: float,
     *,
     spacing: str = "piecewise",
-    exponent: float = 1.0,
+    exponent: float | Tensor = 1.0,
     single_jitter: bool = True,
     generator: torch.Generator | None = None,
     weigh: Callable[[Any, Rays, RaySamples], Tensor] = weigh_density,
@@ -101,8 +101,9 @@ def sample_proposals(
 
     densities: one function per round, at least one; the same one may serve several rounds.
     num_proposal_samples: intervals of each round. near, far, spacing: see `sample_along`.
-    exponent: see `anneal_exponent`. weigh, resample: compiled twins of `weigh_density` and
-    `intervals.sample_pdf`, where the caller has them.
+    exponent: see `anneal_exponent`; a tensor in a step that is captured.
+    weigh, resample: compiled twins of `weigh_density` and `intervals.sample_pdf`, where the caller
+    has them.
     Returns (final samples, samples of each round, weights [R, S] of each round). Positions carry no
     gradient to the rays: cameras are moved by the colour loss alone, and half of the proposals'
     backward pass is spared. Weights carry one to the networks unless under `torch.no_grad()`.
@@ -135,7 +136,8 @@ def sample_proposals(
         weights.append(found)
         jitter = uniform_jitter(len(rays), num_next + 1, single_jitter, generator, found)
         # At exponent 0 even a weight of 0 counts as 1, as torch.pow has it: a flat histogram.
-        shape = found.detach() if exponent == 1.0 else found.detach().pow(exponent)
+        is_one = isinstance(exponent, float) and exponent == 1.0
+        shape = found.detach() if is_one else found.detach().pow(exponent)
         edges = resample(samples.s_edges, shape, num_next, jitter=jitter)
         samples = RaySamples(s_edges=edges, t_edges=t_from_s(edges, near, far, spacing))
     return samples, rounds, weights

@@ -14,18 +14,24 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from pipelines.nerf.cameras import Cameras
 from pipelines.nerf.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.nerf.config import OptimizerConfig, TrainConfig, find_method, validate
+from pipelines.nerf.config import TrainConfig, validate
 from pipelines.nerf.data import ImageData, PixelSampler
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.metrics import psnr_from_mse
 from pipelines.nerf.models.base import Model
+from pipelines.nerf.training_state import (
+    TrainingState,
+    choose_device,
+    initial_state,
+    is_fast,
+    learning_rates,
+)
 
 TIMED_STEPS = 50
 STEPS_PER_CUDA_REPORT = 20
@@ -49,64 +55,6 @@ class TrainProgress:
     elapsed_s: float
     eta_s: float | None
     rays_per_s: float
-
-
-def learning_rate(step: int, initial: float, final: float, decay_steps: int) -> float:
-    """exp((1 - t) ln initial + t ln final), t = step / decay_steps in [0, 1]."""
-    t = min(step / decay_steps, 1.0)
-    return math.exp((1.0 - t) * math.log(initial) + t * math.log(final))
-
-
-def choose_device(wanted: str) -> torch.device:
-    """The device for "auto", "cpu" or "cuda". Raises NerfError where CUDA is asked for in vain."""
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise NerfError(
-            "bad_config",
-            "The option train.device is 'cuda', and this machine has no usable GPU.",
-            "Set train.device to auto or cpu.",
-        )
-    if wanted == "auto":
-        wanted = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(wanted)
-
-
-@dataclass
-class _State:
-    """All that changes from step to step."""
-
-    model: Model
-    optimizers: dict[str, torch.optim.Adam]
-    scaler: torch.amp.GradScaler
-    pixel_random: torch.Generator
-    model_random: torch.Generator
-    step: int = 0
-    elapsed_s: float = 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        return {
-            "model": self.model.state_dict(),
-            "optimizers": {name: item.state_dict() for name, item in self.optimizers.items()},
-            "scaler": self.scaler.state_dict(),
-            "pixel_random": self.pixel_random.get_state(),
-            "model_random": self.model_random.get_state(),
-            "step": self.step,
-            "schedule": self.model.schedule_state(),
-            "elapsed_s": self.elapsed_s,
-        }
-
-    def restore(self, saved: dict[str, Any]) -> None:
-        self.model.load_state_dict(saved["model"])
-        for name, item in self.optimizers.items():
-            item.load_state_dict(saved["optimizers"][name])
-        if saved["scaler"] and self.scaler.is_enabled():
-            self.scaler.load_state_dict(saved["scaler"])
-        for name in ("pixel_random", "model_random"):
-            random: torch.Generator = getattr(self, name)
-            if saved[name].shape == random.get_state().shape:  # else: another kind of device
-                random.set_state(saved[name])
-        self.step = int(saved["step"])
-        self.model.load_schedule_state(saved["schedule"])
-        self.elapsed_s = float(saved["elapsed_s"])
 
 
 def train(
@@ -136,12 +84,15 @@ def train(
     _check_sizes(images, cameras, train_indices)
     device = choose_device(config.device)
     fingerprint = _fingerprint(config, seed, len(train_indices))
-    state = _initial_state(config, len(train_indices), seed, device)
+    state = initial_state(config, len(train_indices), seed, device)
     if checkpoint_path is not None and checkpoint_path.exists():
         _resume(state, checkpoint_path, fingerprint)
     sampler = PixelSampler(images, train_indices, state.pixel_random.device)
     posed = cameras.select(train_indices).to(device)
     model = state.model.train()
+    graphs = None
+    if device.type == "cuda" and is_fast(config, device):
+        graphs = _GpuSteps(state, sampler, posed, config)
     preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
     step_times: deque[float] = deque(maxlen=TIMED_STEPS)
     last_saved = time.monotonic()
@@ -155,7 +106,10 @@ def train(
         started = time.monotonic()
         is_reported = device.type == "cpu" or state.step % STEPS_PER_CUDA_REPORT == 0
         try:
-            losses = _optimise_once(state, sampler, posed, config, check=is_reported)
+            if graphs is not None:
+                losses = graphs.run(state, config, check=is_reported)
+            else:
+                losses = _optimise_once(state, sampler, posed, config, check=is_reported)
         except NonFiniteLoss:
             if _is_finite(model):
                 save()
@@ -178,7 +132,12 @@ def train(
 
 
 def _optimise_once(
-    state: _State, sampler: PixelSampler, cameras: Cameras, config: TrainConfig, *, check: bool
+    state: TrainingState,
+    sampler: PixelSampler,
+    cameras: Cameras,
+    config: TrainConfig,
+    *,
+    check: bool,
 ) -> dict[str, float]:
     """One step: pixels -> rays -> model -> losses -> Adam.
 
@@ -186,7 +145,10 @@ def _optimise_once(
     """
     model = state.model
     device = cameras.focal.device
-    _set_learning_rates(state.optimizers, config.optimizer, state.step)
+    rates = learning_rates(config.optimizer, state.step)
+    for name, optimizer in state.optimizers.items():
+        for group in optimizer.param_groups:
+            group["lr"] = rates[name]
     plan = model.plan_step(state.step, state.model_random)
 
     drawn = sampler.draw(config.rays_per_step, state.pixel_random)
@@ -210,7 +172,41 @@ def _optimise_once(
     return values
 
 
-def _resume(state: _State, path: Path, fingerprint: str) -> None:
+class _GpuSteps:
+    """Steps of the GPU engine (`gpu.step`), which the host starts and does not wait for."""
+
+    def __init__(
+        self, state: TrainingState, sampler: PixelSampler, cameras: Cameras, config: TrainConfig
+    ) -> None:
+        from pipelines.nerf.gpu.step import LossReader, TrainingStep
+
+        self._step = TrainingStep(
+            state.model,
+            state.optimizers,
+            state.scaler,
+            sampler,
+            cameras,
+            config.rays_per_step,
+            pixel_random=state.pixel_random,
+            model_random=state.model_random,
+        )
+        self._reader = LossReader(cameras.focal.device)
+
+    def run(self, state: TrainingState, config: TrainConfig, *, check: bool) -> dict[str, float]:
+        """As `_optimise_once`; the losses are those of the last step that was checked."""
+        self._step.run(state.step, learning_rates(config.optimizer, state.step))
+        state.step += 1
+        if not check:
+            return {}
+        found = self._reader.take()
+        self._reader.send(self._step)
+        if found is None:
+            found = self._step.losses()
+        _require_finite(found.values, found.step)
+        return found.values
+
+
+def _resume(state: TrainingState, path: Path, fingerprint: str) -> None:
     saved = load_checkpoint(path)
     if saved["fingerprint"] != fingerprint:
         raise NerfError(
@@ -221,60 +217,17 @@ def _resume(state: _State, path: Path, fingerprint: str) -> None:
     state.restore(saved)
 
 
-def _initial_state(config: TrainConfig, num_images: int, seed: int, device: torch.device) -> _State:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model: Model = find_method(config.method).build(config.model, num_images).to(device)
-    on_gpu = device.type == "cuda"
-    fast = config.engine == "fast" or (config.engine == "auto" and not on_gpu)
-    model.set_engine("fast" if fast else "plain")
-    networks = list(model.network_parameters())
-    rates = config.optimizer
-    if fast and not on_gpu:
-        # Imported here: a machine that trains on a GPU never loads the compiler.
-        from pipelines.nerf.kernels.engine import make_adam
-        from pipelines.nerf.kernels.gradients import accumulate_in_place
-
-        accumulate_in_place(model)
-        adam = make_adam(networks, rates.lr, rates.eps)
-    else:
-        adam = torch.optim.Adam(networks, lr=rates.lr, eps=rates.eps, fused=True)
-    optimizers = {"networks": adam}
-    if config.model.camera_mode != "off":
-        optimizers["cameras"] = torch.optim.Adam(
-            model.cameras_delta.parameters(), lr=rates.camera_lr, eps=rates.eps
-        )
-    return _State(
-        model=model,
-        optimizers=optimizers,
-        scaler=torch.amp.GradScaler(device.type, enabled=on_gpu),
-        pixel_random=torch.Generator(device if config.data.images_on_gpu else "cpu").manual_seed(
-            seed
-        ),
-        model_random=torch.Generator(device).manual_seed(seed + 1),
-    )
-
-
-def _set_learning_rates(
-    optimizers: dict[str, torch.optim.Adam], rates: OptimizerConfig, step: int
-) -> None:
-    wanted = {
-        "networks": learning_rate(step, rates.lr, rates.lr_final, rates.decay_steps),
-        "cameras": learning_rate(
-            step, rates.camera_lr, rates.camera_lr_final, rates.camera_decay_steps
-        ),
-    }
-    for name, optimizer in optimizers.items():
-        for group in optimizer.param_groups:
-            group["lr"] = wanted[name]
-
-
 class NonFiniteLoss(NerfError):
     """A loss is NaN or infinite; nothing was learned from that step."""
 
 
 def _checked_values(losses: dict[str, Tensor], step: int) -> dict[str, float]:
     values = {name: float(loss.detach()) for name, loss in losses.items()}
+    _require_finite(values, step)
+    return values
+
+
+def _require_finite(values: dict[str, float], step: int) -> None:
     for name, value in values.items():
         if not math.isfinite(value):
             raise NonFiniteLoss(
@@ -283,7 +236,6 @@ def _checked_values(losses: dict[str, Tensor], step: int) -> dict[str, float]:
                 "Train with a lower train.optimizer.lr, from the checkpoint of the step before or "
                 "from the start, and check the camera poses.",
             )
-    return values
 
 
 def _is_finite(model: Model) -> bool:
@@ -296,7 +248,7 @@ def _time_is_up(elapsed_s: float, config: TrainConfig) -> bool:
 
 
 def _progress(
-    state: _State, config: TrainConfig, losses: dict[str, float], step_times: deque[float]
+    state: TrainingState, config: TrainConfig, losses: dict[str, float], step_times: deque[float]
 ) -> TrainProgress:
     per_step = sum(step_times) / len(step_times)
     eta_s = (config.max_steps - state.step) * per_step

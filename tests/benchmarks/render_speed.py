@@ -29,7 +29,7 @@ from pipelines.nerf.config import DataConfig
 from pipelines.nerf.metrics import psnr
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.renderer import Renderer
-from pipelines.nerf.training import choose_device
+from pipelines.nerf.training_state import choose_device
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import load_capture
 from tests.benchmarks.machine import describe, heading, wait_for_gpu

@@ -28,7 +28,8 @@ import torch
 from pipelines.nerf.cameras import Cameras
 from pipelines.nerf.config import TrainConfig, find_method
 from pipelines.nerf.data import PixelSampler
-from pipelines.nerf.training import TrainProgress, choose_device, train
+from pipelines.nerf.training import TrainProgress, train
+from pipelines.nerf.training_state import choose_device
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.machine import describe, heading, wait_for_gpu

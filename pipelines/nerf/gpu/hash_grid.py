@@ -51,15 +51,13 @@ def _cell_of(points, point, axis: tl.constexpr, inside, resolution):
 def _row_of(x, y, z, resolution, is_dense, mask):
     """Rows, counted from the first of the level, of vertices [B]; int32.
 
-    is_dense is the same for all lanes, so the branch that is not taken costs nothing.
+    Both are computed and one is chosen: a branch for each corner would keep the reads of the eight
+    corners from being under way together.
     """
-    if is_dense:
-        stride = resolution + 1
-        row = x + stride * (y + stride * z)
-    else:
-        hashed = x.to(tl.uint32) ^ (y.to(tl.uint32) * PRIME_Y) ^ (z.to(tl.uint32) * PRIME_Z)
-        row = (hashed & mask.to(tl.uint32)).to(tl.int32)
-    return row
+    stride = resolution + 1
+    linear = x + stride * (y + stride * z)
+    hashed = x.to(tl.uint32) ^ (y.to(tl.uint32) * PRIME_Y) ^ (z.to(tl.uint32) * PRIME_Z)
+    return tl.where(is_dense, linear, (hashed & mask.to(tl.uint32)).to(tl.int32))
 
 
 @triton.jit

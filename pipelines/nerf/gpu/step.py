@@ -51,7 +51,7 @@ class StepLosses:
 
 
 def capturable_adam(
-    parameters: Iterable[nn.Parameter], rate: float, eps: float, device: torch.device
+    parameters: Iterable[nn.Parameter], lr: float, eps: float, device: torch.device
 ) -> torch.optim.Adam:
     """Adam whose step can be captured: its rate, its count of steps and its skips are tensors.
 
@@ -59,9 +59,18 @@ def capturable_adam(
     optimiser with a number for its rate.
     """
     if device.type != "cuda":
-        return torch.optim.Adam(parameters, lr=rate, eps=eps, fused=True)
-    held = torch.tensor(rate, dtype=torch.float32, device=device)
+        return torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
+    held = torch.tensor(lr, dtype=torch.float32, device=device)
     return torch.optim.Adam(parameters, lr=held, eps=eps, fused=True, capturable=True)
+
+
+def _hold_on_device(optimizer: torch.optim.Adam, device: torch.device) -> None:
+    """Undo what restoring a checkpoint may have done: rates and counts of steps as tensors."""
+    for group in optimizer.param_groups:
+        group["lr"] = torch.as_tensor(group["lr"], dtype=torch.float32, device=device)
+        group["capturable"] = True
+    for state in optimizer.state.values():
+        state["step"] = torch.as_tensor(state["step"], dtype=torch.float32, device=device)
 
 
 def loss_scale(rays_per_step: int) -> float:
@@ -133,6 +142,9 @@ class TrainingStep:
                 torch.zeros(rays_per_step, 2, device=self.device),
                 torch.zeros(rays_per_step, 3, device=self.device),
             )
+        if self.captures:
+            for optimizer in self.optimizers.values():
+                _hold_on_device(optimizer, self.device)
         self._exponent = torch.ones((), dtype=torch.float32, device=self.device)
         self._values = torch.zeros(MAX_TERMS, dtype=torch.float32, device=self.device)
         self._names: dict[_Kind, tuple[str, ...]] = {}
@@ -147,7 +159,7 @@ class TrainingStep:
         """
         self._set_rates(rates)
         plan = self._model.plan_step(step, self._model_random)
-        kind = _Kind(plan.update_proposals, plan.exponent != 1.0)
+        kind = _Kind(plan.update_proposals, bool(plan.exponent != 1.0))
         if self._stream is None:
             self._run_as(kind, plan)
         else:

@@ -29,7 +29,8 @@ class Outputs(TypedDict):
 
     rgb: [R, 3] in [0, 1]. accumulation: [R] in [0, 1].
     depth: [R], median; expected_depth: [R]; both distances along the ray in scene units.
-    weights: [R, S] of each round of samples, the last one's for the colour; samples: likewise.
+    weights: [R, S] of each round of samples, the last one's for the colour; samples: likewise;
+        both empty for methods whose rays have different numbers of samples.
     extra: tensors that the method's own losses need, by name.
     normals, predicted_normals: [R, 3], scene axes, of unit length or zero where nothing is, from a
         method that was asked for them.
@@ -50,12 +51,13 @@ class Outputs(TypedDict):
 class StepPlan:
     """What one training step does besides the usual; made by `Model.plan_step`.
 
-    step: counted from 0. exponent: the power of proposal weights before resampling.
+    step: counted from 0. exponent: the power of proposal weights before resampling; a tensor on the
+        device where the step is captured, so that it can differ from run to run.
     update_proposals: whether the sampler's own networks learn in this step.
     """
 
     step: int
-    exponent: float = 1.0
+    exponent: float | Tensor = 1.0
     update_proposals: bool = True
 
 

@@ -61,7 +61,7 @@ class Nerfacto(Model):
         if config.predict_normals:
             self.normal_head = PredictedNormals(config.geo_feature_dim)
         self.steps_since_update = 0
-        self.kernels: Any = None
+        self.engine = "plain"
 
     def round_networks(self) -> list[nn.Module]:
         """The proposal network of each round, in order; the same one each time where shared."""
@@ -93,14 +93,18 @@ class Nerfacto(Model):
     def set_engine(self, engine: str) -> None:
         """As `Model.set_engine`. Learned normals need second derivatives, which only plain has."""
         super().set_engine(engine)
-        self.kernels = None
-        if engine == "fast":
-            # Imported here: a machine that trains on a GPU never loads the compiler.
-            from pipelines.nerf.kernels import engine as kernels
-
-            self.kernels = kernels
+        self.engine = engine
         if self.normal_head is not None and self.field.hash_grid is not None:
             self.field.hash_grid.engine = "plain"
+
+    def _kernels(self, where: Tensor) -> Any:
+        """The compiled parts (`kernels.engine`) for float32 tensors on the CPU, else None."""
+        if self.engine != "fast" or where.device.type != "cpu" or where.dtype != torch.float32:
+            return None
+        # Imported here: a machine that trains on a GPU never loads the compiler.
+        from pipelines.nerf.kernels import engine
+
+        return engine
 
     def forward(
         self,
@@ -117,7 +121,7 @@ class Nerfacto(Model):
         config = self.config
         rays = self.corrected(rays)
         plan = plan or StepPlan(0)
-        kernels = self.kernels if rays.origins.device.type == "cpu" else None
+        kernels = self._kernels(rays.origins)
         with nullcontext() if plan.update_proposals else torch.no_grad():
             final, samples, weights = sample_proposals(
                 rays,
@@ -133,7 +137,7 @@ class Nerfacto(Model):
                 weigh=kernels.weigh if kernels else weigh_density,
                 resample=kernels.resample if kernels else sample_pdf,
             )
-        codes = self._codes(rays, appearance)
+        codes = self._codes(rays, appearance, generator)
         points = geometry = None
         if kernels and self.normal_head is None and kernels.knows_field(self.field):
             rgb, found = kernels.shade(self.field, rays, final, codes, config.background, generator)
@@ -184,8 +188,8 @@ class Nerfacto(Model):
         if (plan is None or plan.update_proposals) and config.interlevel_weight > 0.0:
             edges = [samples.s_edges for samples in proposal_samples]
             pairs = list(zip(edges, proposal_weights, strict=True))
-            on_cpu = weights.device.type == "cpu" and self.kernels is not None
-            loss = self.kernels.interlevel_loss if on_cpu else interlevel_loss
+            kernels = self._kernels(weights)
+            loss = kernels.interlevel_loss if kernels else interlevel_loss
             interlevel = loss(final.s_edges, weights, pairs)
             losses["interlevel"] = config.interlevel_weight * interlevel
         if config.distortion_weight > 0.0:
@@ -228,11 +232,18 @@ class Nerfacto(Model):
         ]
         return max(hash_grid_bytes(count, [grid]) for count, grid in pairs)
 
-    def _codes(self, rays: Rays, appearance: Appearance) -> Tensor | None:
-        if self.training:
-            return self.field.codes(rays.camera_indices)
+    def _codes(
+        self, rays: Rays, appearance: Appearance, generator: torch.Generator | None
+    ) -> Tensor | None:
         if self.field.appearance is None:
             return None
+        if self.training:
+            codes = self.field.codes(rays.camera_indices)
+            if codes is None or generator is None or self.config.appearance_dropout <= 0.0:
+                return codes
+            drawn = torch.rand((len(rays), 1), generator=generator, device=codes.device)
+            is_dropped = drawn < self.config.appearance_dropout
+            return torch.where(is_dropped, self.field.appearance.weight.mean(dim=0), codes)
         if isinstance(appearance, Tensor):
             code = appearance
         elif appearance is not None:

@@ -45,6 +45,7 @@ def test_truncated_exp_is_exp_with_a_bounded_gradient() -> None:
 
 
 def test_mlp_has_relu_between_layers_and_none_behind_the_last() -> None:
+    torch.manual_seed(0)
     mlp = MLP(3, 5, 5, 2)
     values = torch.randn(50, 3)
     first, second, last = mlp.layers

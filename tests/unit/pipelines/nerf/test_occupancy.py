@@ -83,6 +83,20 @@ def test_a_cell_is_full_above_the_threshold_or_above_the_mean_where_that_is_lowe
     assert torch.equal(high.occupied[0], values > 31.5)
 
 
+def test_a_cell_twice_as_wide_is_full_at_half_the_density() -> None:
+    grid = _grid(4, 3, threshold=8.0)
+    for density, full in ((9.0, [1, 1, 1]), (5.0, [0, 1, 1]), (3.0, [0, 0, 1]), (1.0, [0, 0, 0])):
+        # A mean above the threshold, so that the threshold decides.
+        grid.density.zero_()
+        grid.density[:, 0] = 1e6
+
+        def same(points: Tensor, density: float = density) -> Tensor:
+            return torch.full(points.shape[:-1], density)
+
+        grid.update(same, everywhere=True)
+        assert grid.occupied[:, 1].int().tolist() == full
+
+
 def test_an_empty_world_has_no_full_cell() -> None:
     grid = _grid(4, 1)
     grid.update(lambda points: torch.zeros(points.shape[:-1]), everywhere=True)

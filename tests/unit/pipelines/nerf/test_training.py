@@ -19,7 +19,8 @@ from pipelines.nerf.metrics import psnr
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.renderer import Renderer
-from pipelines.nerf.training import TrainProgress, learning_rate, train
+from pipelines.nerf.training import TrainProgress, train
+from pipelines.nerf.training_state import learning_rate
 from tests.unit.pipelines.nerf.toy_scene import (
     RADIUS,
     SIZE,

@@ -45,8 +45,10 @@ def drawn(
     return points.to(DEVICE), table.to(DEVICE), levels
 
 
-@pytest.mark.parametrize("config", [MIXED, ONLY_DENSE, ONLY_HASHED])
-@pytest.mark.parametrize("num_features", [1, 2, 3, 4, 8])
+@pytest.mark.parametrize(
+    ("config", "num_features"),
+    [(MIXED, 1), (MIXED, 2), (MIXED, 3), (MIXED, 8), (ONLY_DENSE, 2), (ONLY_HASHED, 2)],
+)
 def test_features_are_those_of_the_plain_definition(
     config: HashGridConfig, num_features: int
 ) -> None:
@@ -88,8 +90,7 @@ def test_leading_dimensions_are_kept_and_no_points_give_no_features() -> None:
     assert hash_encode_triton(points[:0], table, *levels).shape == (0, 6)
 
 
-@pytest.mark.parametrize("num_features", [1, 2, 4])
-@pytest.mark.parametrize("config", [MIXED, ONLY_DENSE])
+@pytest.mark.parametrize(("config", "num_features"), [(MIXED, 1), (MIXED, 4), (ONLY_DENSE, 2)])
 def test_gradients_are_those_of_the_plain_definition(
     config: HashGridConfig, num_features: int
 ) -> None:
@@ -99,15 +100,16 @@ def test_gradients_are_those_of_the_plain_definition(
     found = []
     for encode in (hash_encode_triton, hash_encode):
         place, entries = points.clone().requires_grad_(), table.clone().requires_grad_()
-        encode(place, entries, *levels).backward(incoming)
-        found.append((place.grad, entries.grad))
+        found.append(
+            torch.autograd.grad(encode(place, entries, *levels), (place, entries), incoming)
+        )
     torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-5, atol=1e-5)
 
 
 def test_point_gradients_are_the_slopes_of_the_features() -> None:
-    points, table, levels = drawn(MIXED, 2, 2, torch.float64)
-    place = points.clamp(0.05, 0.95).requires_grad_()
+    points, table, levels = drawn(ONLY_DENSE, 2, 1, torch.float64)
+    place = (0.3 + 0.5 * points).requires_grad_()
     assert torch.autograd.gradcheck(lambda where: hash_encode_triton(where, table, *levels), place)
 
 
@@ -115,37 +117,35 @@ def test_table_gradient_sums_to_the_incoming_gradient() -> None:
     points, table, levels = drawn(MIXED, 50, 2, torch.float32)
     entries = table.clone().requires_grad_()
     incoming = torch.randn(50, 6, device=DEVICE)
-    hash_encode_triton(points, entries, *levels).backward(incoming)
-    assert entries.grad is not None
+    (found,) = torch.autograd.grad(hash_encode_triton(points, entries, *levels), entries, incoming)
     torch.testing.assert_close(
-        entries.grad.sum(0), incoming.reshape(50, 3, 2).sum((0, 1)), rtol=1e-4, atol=1e-4
+        found.sum(0), incoming.reshape(50, 3, 2).sum((0, 1)), rtol=1e-4, atol=1e-4
     )
 
 
 def test_points_beyond_a_face_do_not_move_along_its_axis() -> None:
     _, table, levels = drawn(MIXED, 1, 2, torch.float32)
     point = torch.tensor([[1.5, 0.3, -0.2]], device=DEVICE, requires_grad=True)
-    hash_encode_triton(point, table, *levels).sum().backward()
-    assert point.grad is not None
-    assert point.grad[0, 0] == 0.0
-    assert point.grad[0, 1] != 0.0
-    assert point.grad[0, 2] == 0.0
+    (found,) = torch.autograd.grad(hash_encode_triton(point, table, *levels).sum(), point)
+    assert found[0, 0] == 0.0
+    assert found[0, 1] != 0.0
+    assert found[0, 2] == 0.0
 
 
-@pytest.mark.parametrize("num_features", [1, 2, 4])
+@pytest.mark.parametrize("num_features", [1, 2])
 def test_a_half_precision_copy_is_read_and_the_master_learns(num_features: int) -> None:
     points, table, levels = drawn(MIXED, 40, num_features, torch.float32)
     half = table.half()
     incoming = torch.randn(40, 3 * num_features, device=DEVICE)
     place, entries = points.clone().requires_grad_(), table.clone().requires_grad_()
     found = hash_encode_triton(place, entries, *levels, lookup=half)
-    found.backward(incoming)
     plain_place, plain_entries = points.clone().requires_grad_(), half.float().requires_grad_()
     expected = hash_encode(plain_place, plain_entries, *levels)
-    expected.backward(incoming)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(entries.grad, plain_entries.grad, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(place.grad, plain_place.grad, rtol=1e-4, atol=1e-3)
+    ours = torch.autograd.grad(found, (place, entries), incoming)
+    theirs = torch.autograd.grad(expected, (plain_place, plain_entries), incoming)
+    torch.testing.assert_close(ours[0], theirs[0], rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(ours[1], theirs[1], rtol=1e-5, atol=1e-5)
 
 
 def test_a_point_that_is_not_a_number_gives_features_that_are_none() -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import traceback
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from pipelines import nerf
 from pipelines.nerf.config import TrainConfig, find_method
 from pipelines.nerf.data import PixelSampler
 from pipelines.nerf.gpu.step import (
@@ -18,11 +23,13 @@ from pipelines.nerf.gpu.step import (
     loss_scale,
     loss_scaler,
 )
-from pipelines.nerf.models.base import Model
-from pipelines.nerf.training import learning_rate, train
+from pipelines.nerf.models.base import Model, StepPlan
+from pipelines.nerf.training import train
+from pipelines.nerf.training_state import learning_rate
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
 CPU = torch.device("cpu")
+NERF = Path(nerf.__file__).parent
 SEED = 5
 STEPS = 14  # past the first ten, after which the proposals learn in some steps only
 
@@ -158,6 +165,50 @@ def test_loss_scale_is_the_next_power_of_two_above_eight_times_the_rays(
 ) -> None:
     assert loss_scale(rays) == expected
     assert not loss_scaler(CPU, rays).is_enabled()
+
+
+ASKING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero", "equal")
+"""Operations whose result the host has to wait for: item, bool, data-dependent shapes."""
+
+
+class Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Notes the operations that would make a host wait for its GPU, with the file that asked."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.found: list[tuple[str, str]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        # `lift_fresh` is a tensor made from Python numbers, copied to wherever it is to be.
+        if name in ASKING or name == "lift_fresh":
+            files = (Path(frame.filename) for frame in traceback.extract_stack())
+            ours = [file.name for file in files if NERF in file.parents]
+            self.found.append((name, ours[-1] if ours else "elsewhere"))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("update", [True, False])
+def test_a_model_asks_its_device_for_nothing_in_a_step(update: bool) -> None:
+    model, _ = toy_step(rare_updates())
+    cameras = toy_cameras(6)
+    rays = cameras.generate_rays(torch.arange(6), torch.full((6, 2), 11.5))
+    plan = StepPlan(12, exponent=0.5, update_proposals=update)
+    random = torch.Generator().manual_seed(0)
+    with Watch() as watch:
+        outputs = model(rays, plan=plan, generator=random)
+        losses = model.loss_dict(outputs, torch.rand(6, 3), plan=plan)
+        torch.autograd.backward(torch.stack(list(losses.values())).sum())
+    # The ends of the spacing, worked out on the CPU wherever the rays are.
+    assert set(watch.found) <= {("lift_fresh", "intervals.py")}
+
+
+def test_the_watch_sees_what_a_host_waits_for() -> None:
+    with Watch() as watch:
+        values = torch.tensor([0.0, 1.0])
+        assert bool(values.sum() > 0.0)
+        torch.nonzero(values)
+    assert [name for name, _ in watch.found] == ["lift_fresh", "_local_scalar_dense", "nonzero"]
 
 
 def test_nothing_is_captured_on_a_cpu() -> None:

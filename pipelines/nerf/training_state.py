@@ -1,0 +1,147 @@
+"""What a training run carries from step to step: model, optimisers, random numbers; its device.
+
+Whatever a resumed run needs is in `TrainingState.as_dict`, as tensors and plain values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import nn
+
+from pipelines.nerf.config import OptimizerConfig, TrainConfig, find_method
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.models.base import Model
+
+MakeAdam = Callable[..., torch.optim.Adam]
+"""Called with parameters, `lr` and `eps`."""
+
+
+def learning_rate(step: int, initial: float, final: float, decay_steps: int) -> float:
+    """exp((1 - t) ln initial + t ln final), t = step / decay_steps in [0, 1]."""
+    t = min(step / decay_steps, 1.0)
+    return math.exp((1.0 - t) * math.log(initial) + t * math.log(final))
+
+
+def learning_rates(rates: OptimizerConfig, step: int) -> dict[str, float]:
+    """The rate of each optimiser, by its name."""
+    return {
+        "networks": learning_rate(step, rates.lr, rates.lr_final, rates.decay_steps),
+        "cameras": learning_rate(
+            step, rates.camera_lr, rates.camera_lr_final, rates.camera_decay_steps
+        ),
+    }
+
+
+def choose_device(wanted: str) -> torch.device:
+    """The device for "auto", "cpu" or "cuda". Raises NerfError where CUDA is asked for in vain."""
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise NerfError(
+            "bad_config",
+            "The option train.device is 'cuda', and this machine has no usable GPU.",
+            "Set train.device to auto or cpu.",
+        )
+    if wanted == "auto":
+        wanted = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(wanted)
+
+
+@dataclass
+class TrainingState:
+    """All that changes from step to step."""
+
+    model: Model
+    optimizers: dict[str, torch.optim.Adam]
+    scaler: torch.amp.GradScaler
+    pixel_random: torch.Generator
+    model_random: torch.Generator
+    step: int = 0
+    elapsed_s: float = 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "model": self.model.state_dict(),
+            "optimizers": {name: item.state_dict() for name, item in self.optimizers.items()},
+            "scaler": self.scaler.state_dict(),
+            "pixel_random": self.pixel_random.get_state(),
+            "model_random": self.model_random.get_state(),
+            "step": self.step,
+            "schedule": self.model.schedule_state(),
+            "elapsed_s": self.elapsed_s,
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        self.model.load_state_dict(saved["model"])
+        for name, item in self.optimizers.items():
+            item.load_state_dict(saved["optimizers"][name])
+        if saved["scaler"] and self.scaler.is_enabled():
+            self.scaler.load_state_dict(saved["scaler"])
+        for name in ("pixel_random", "model_random"):
+            random: torch.Generator = getattr(self, name)
+            if saved[name].shape == random.get_state().shape:  # else: another kind of device
+                random.set_state(saved[name])
+        self.step = int(saved["step"])
+        self.model.load_schedule_state(saved["schedule"])
+        self.elapsed_s = float(saved["elapsed_s"])
+
+
+def is_fast(config: TrainConfig, device: torch.device) -> bool:
+    """Whether the compiled engine trains; "auto" takes it on the CPU alone.
+
+    That of GPUs is right in Triton's interpreter and has not been measured on one: it is asked for
+    by name.
+    """
+    return config.engine == "fast" or (config.engine == "auto" and device.type == "cpu")
+
+
+def _plain_adam(parameters: Iterable[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
+    return torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
+
+
+def initial_state(
+    config: TrainConfig, num_images: int, seed: int, device: torch.device
+) -> TrainingState:
+    """The state before the first step; the seed decides it."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model: Model = find_method(config.method).build(config.model, num_images).to(device)
+    on_gpu = device.type == "cuda"
+    fast = is_fast(config, device)
+    model.set_engine("fast" if fast else "plain")
+    networks = list(model.network_parameters())
+    rates = config.optimizer
+    scaler = torch.amp.GradScaler(device.type, enabled=on_gpu)
+    # Imported where they are chosen: nobody loads the compiler of the other kind of device.
+    if fast and on_gpu:
+        from pipelines.nerf.gpu.step import capturable_adam, loss_scaler
+
+        scaler = loss_scaler(device, config.rays_per_step)
+        adam: MakeAdam = partial(capturable_adam, device=device)
+    elif fast:
+        from pipelines.nerf.kernels.engine import make_adam
+        from pipelines.nerf.kernels.gradients import accumulate_in_place
+
+        accumulate_in_place(model)
+        adam = make_adam
+    else:
+        adam = _plain_adam
+    optimizers = {"networks": adam(networks, lr=rates.lr, eps=rates.eps)}
+    if config.model.camera_mode != "off":
+        cameras = list(model.cameras_delta.parameters())
+        # A few hundred numbers: no need of a compiled pass, but of one that can be captured.
+        few = adam if on_gpu and fast else torch.optim.Adam
+        optimizers["cameras"] = few(cameras, lr=rates.camera_lr, eps=rates.eps)
+    return TrainingState(
+        model=model,
+        optimizers=optimizers,
+        scaler=scaler,
+        pixel_random=torch.Generator(device if config.data.images_on_gpu else "cpu").manual_seed(
+            seed
+        ),
+        model_random=torch.Generator(device).manual_seed(seed + 1),
+    )
