@@ -172,25 +172,3 @@ def normalise(world_from_camera: Array, *, orient: bool = True) -> Normalisation
     scale = 1.0 / reach if reach > 1e-12 else 1.0
     similarity = Similarity(rotation=rotation, translation=-scale * rotation @ center, scale=scale)
     return Normalisation(similarity, up_from, "centers" if focus is None else "focus")
-
-
-def align_points(source: Array, target: Array) -> Similarity:
-    """The similarity that moves `source` onto `target`, least squares.
-
-    source, target: [N, 3], N >= 3, not all on one line. Source: Umeyama, "Least-squares estimation
-    of transformation parameters between two point patterns", 1991. Raises ValueError for shapes
-    that do not fit or points that coincide.
-    """
-    if source.shape != target.shape or source.ndim != 2 or len(source) < 3:
-        raise ValueError(f"cannot align {list(source.shape)} with {list(target.shape)} points")
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    centered = source - source_mean
-    variance = float((centered**2).sum() / len(source))
-    if variance == 0.0:
-        raise ValueError("cannot align points that coincide")
-    covariance = (target - target_mean).T @ centered / len(source)
-    left, singular, right = np.linalg.svd(covariance)
-    signs = np.array([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
-    rotation = left @ np.diag(signs) @ right
-    scale = float((singular * signs).sum() / variance)
-    return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)

@@ -6,29 +6,12 @@ brings one set of points onto another; everything else is then judged under that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.orientation import Similarity
+
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """target = scale * rotation @ source + translation.
-
-    scale: > 0. rotation: [3, 3], proper. translation: [3], in the target's units.
-    """
-
-    scale: float
-    rotation: Floats
-    translation: Floats
-
-    def apply(self, points: Floats) -> Floats:
-        """points [N, 3] of the source frame -> [N, 3] in the target frame."""
-        moved: Floats = self.scale * points @ self.rotation.T + self.translation
-        return moved
 
 
 def similarity(source: Floats, target: Floats) -> Similarity:
@@ -51,7 +34,7 @@ def similarity(source: Floats, target: Floats) -> Similarity:
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * signs) @ vt
     scale = float((singular * signs).sum() / (from_mean**2).sum(axis=1).mean())
-    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+    return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
 
 
 def path_extent(centers: Floats) -> float:

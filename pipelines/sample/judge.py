@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.cameras_file import CamerasFile, PosedImage
-from pipelines.sample.align import Floats, Similarity, path_extent, similarity
+from pipelines.orientation import Similarity
+from pipelines.sample.align import Floats, path_extent, similarity
 from pipelines.sample.scene import SUBJECT, Region, pose_matrix, seen_surface, surface_distance
 
 
@@ -58,7 +59,9 @@ def judge_poses(cameras: CamerasFile, truth: CamerasFile) -> PosesJudgement:
     true = np.array([pose_matrix(image) for _, image in pairs])
     alignment = similarity(found[:, :, 3], true[:, :, 3])
     extent = path_extent(np.array([pose_matrix(image)[:, 3] for image in truth.images]))
-    errors = np.linalg.norm(alignment.apply(found[:, :, 3]) - true[:, :, 3], axis=1) / extent
+    errors = (
+        np.linalg.norm(alignment.apply_to_points(found[:, :, 3]) - true[:, :, 3], axis=1) / extent
+    )
     turned = np.einsum("ij,njk,nlk->nil", alignment.rotation, found[:, :, :3], true[:, :, :3])
     cosines = (np.trace(turned, axis1=1, axis2=2) - 1.0) / 2.0
     return PosesJudgement(
@@ -100,7 +103,7 @@ def judge_mesh(
     """
     if len(faces) == 0:
         raise ValueError("a mesh without faces cannot be judged")
-    moved = alignment.apply(np.asarray(vertices, dtype=np.float64))
+    moved = alignment.apply_to_points(np.asarray(vertices, dtype=np.float64))
     points = _points_on_mesh(moved, faces, num_points)
     points = points[region.contains(points)]
     points = points[_in_view(points, truth)]

@@ -15,7 +15,7 @@ from PIL import Image
 
 from pipelines.cameras_file import CamerasFile
 from pipelines.options import PosesOptions
-from pipelines.orientation import align_points
+from pipelines.sample.align import similarity
 from pipelines.stage import StageContext
 from pipelines.stages.poses import run
 from pipelines.workspace import Workspace
@@ -61,7 +61,7 @@ def test_fox_photos_agree_with_the_published_poses(captures: Path, tmp_path: Pat
     pose_of = {Path(f["file_path"]).name: f["transform_matrix"] for f in published["frames"]}
     poses = np.array([image.world_from_camera for image in cameras.images])
     truth = np.array([pose_of[Path(image.file).name] for image in cameras.images])[:, :3]
-    move = align_points(poses[:, :, 3], truth[:, :, 3])
+    move = similarity(poses[:, :, 3], truth[:, :, 3])
     aligned = move.apply_to_cameras(poses)
     extent = float(np.ptp(truth[:, :, 3], axis=0).max())
     errors = np.linalg.norm(aligned[:, :, 3] - truth[:, :, 3], axis=1)

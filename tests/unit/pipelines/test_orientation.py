@@ -7,7 +7,6 @@ import pytest
 
 from pipelines.orientation import (
     Similarity,
-    align_points,
     find_focus,
     find_up,
     normalise,
@@ -157,24 +156,3 @@ def test_opencv_cameras_turn_about_their_own_x_axis() -> None:
     np.testing.assert_array_equal(ours[:, 1], -pose[0, :, 1])
     np.testing.assert_array_equal(-ours[:, 2], pose[0, :, 2])
     np.testing.assert_array_equal(ours[:, 3], pose[0, :, 3])
-
-
-def test_alignment_recovers_a_similarity() -> None:
-    points = np.random.default_rng(8).normal(size=(30, 3))
-    truth = Similarity(random_rotation(8), np.array([1.0, -2.0, 0.5]), 0.3)
-    found = align_points(points, truth.apply_to_points(points))
-    np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-9)
-    np.testing.assert_allclose(found.translation, truth.translation, atol=1e-9)
-    assert found.scale == pytest.approx(0.3)
-
-
-def test_alignment_never_mirrors() -> None:
-    points = np.random.default_rng(9).normal(size=(30, 3))
-    assert np.linalg.det(align_points(points, points * [1, 1, -1]).rotation) == pytest.approx(1.0)
-
-
-def test_alignment_refuses_what_cannot_be_aligned() -> None:
-    with pytest.raises(ValueError, match="cannot align"):
-        align_points(np.zeros((2, 3)), np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="coincide"):
-        align_points(np.ones((5, 3)), np.ones((5, 3)))

@@ -35,9 +35,9 @@ def test_similarity_of_noisy_points_is_a_least_squares_optimum() -> None:
     source = random.normal(size=(40, 3))
     target = 0.5 * source @ _rotation(2).T + random.normal(size=(40, 3)) * 0.05
     found = similarity(source, target)
-    best = ((found.apply(source) - target) ** 2).sum()
+    best = ((found.apply_to_points(source) - target) ** 2).sum()
     for scale in (0.99, 1.01):
-        moved = scale * (found.apply(source) - found.translation) + found.translation
+        moved = scale * (found.apply_to_points(source) - found.translation) + found.translation
         assert ((moved - target) ** 2).sum() > best
 
 

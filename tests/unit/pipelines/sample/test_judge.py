@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.cameras_file import CamerasFile
-from pipelines.sample.align import Similarity
+from pipelines.orientation import Similarity
 from pipelines.sample.film import phone_camera, walk
 from pipelines.sample.judge import judge_mesh, judge_poses
 from pipelines.sample.scene import SUBJECT, THINGS, Floats, depth_image, pixel_rays, pose_matrix
 
 TRUTH = walk(12, phone_camera(240))
-IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+IDENTITY = Similarity(np.eye(3), np.zeros(3), 1.0)
 
 
 def _moved(cameras: CamerasFile, move: Similarity, noise: float = 0.0) -> CamerasFile:
@@ -23,7 +23,7 @@ def _moved(cameras: CamerasFile, move: Similarity, noise: float = 0.0) -> Camera
     images = []
     for image in cameras.images:
         pose = pose_matrix(image)
-        center = move.apply(pose[None, :, 3])[0] + noise * random.normal(size=3)
+        center = move.apply_to_points(pose[None, :, 3])[0] + noise * random.normal(size=3)
         turned = np.column_stack([move.rotation @ pose[:, :3], center])
         rows = tuple(tuple(map(float, row)) for row in turned)
         images.append(replace(image, world_from_camera=rows))
@@ -59,7 +59,7 @@ def test_poses_in_another_frame_are_judged_perfect() -> None:
     rotation = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
     )
-    judged = judge_poses(_moved(TRUTH, Similarity(0.3, rotation, np.array([5.0, 1, 2]))), TRUTH)
+    judged = judge_poses(_moved(TRUTH, Similarity(rotation, np.array([5.0, 1, 2]), 0.3)), TRUTH)
     assert judged.num_images == 12
     assert judged.mean_center_error < 1e-9
     assert judged.mean_rotation_error_deg < 1e-3
@@ -98,7 +98,7 @@ def test_a_displaced_or_wrongly_scaled_mesh_is_not_accurate() -> None:
     displaced = judge_mesh(vertices, faces, IDENTITY, TRUTH, num_points=4000)
     assert displaced.accuracy > 0.02
     vertices, faces = _true_mesh()
-    larger = Similarity(1.3, np.eye(3), np.zeros(3))
+    larger = Similarity(np.eye(3), np.zeros(3), 1.3)
     # The floor lies on itself at any scale; the things on it do not.
     scaled = judge_mesh(vertices, faces, larger, TRUTH, THINGS, num_points=4000)
     assert scaled.completeness > 0.01
