@@ -32,6 +32,7 @@ _tensor_geometry: Any = open3d.t.geometry
 _utility: Any = open3d.utility
 
 _BLOCK = 8
+_NOTHING_TOUCHED = "No block is touched"
 _TRUNCATION_VOXELS = 5.0
 _MIN_VIEWS = 2.0
 _MIN_COMPONENT_SHARE = 0.02
@@ -112,14 +113,20 @@ def _blocks_near_surface(
         if not wanted.any():
             continue
         depth = np.where(wanted, view.z_depth, 0.0).astype(np.float32)
-        keys = grid.compute_unique_block_coordinates(
-            _tensor_geometry.Image(_core.Tensor(depth[..., None])),
-            _core.Tensor(view.lens.matrix()),
-            _core.Tensor(view.camera_from_world_cv(origin)),
-            1.0,
-            _farthest(view),
-            _TRUNCATION_VOXELS,
-        )
+        try:
+            keys = grid.compute_unique_block_coordinates(
+                _tensor_geometry.Image(_core.Tensor(depth[..., None])),
+                _core.Tensor(view.lens.matrix()),
+                _core.Tensor(view.camera_from_world_cv(origin)),
+                1.0,
+                _farthest(view),
+                _TRUNCATION_VOXELS,
+            )
+        except RuntimeError as error:
+            # Open3D looks at every fourth pixel, and calls it an error when none of them counts.
+            if _NOTHING_TOUCHED not in str(error):
+                raise
+            continue
         found.update(map(tuple, keys.numpy().tolist()))
     return np.asarray(sorted(found), dtype=np.int32).reshape(-1, 3)
 

@@ -92,6 +92,20 @@ def test_nothing_inside_the_bounds_gives_an_empty_mesh(views: list[DepthView]) -
     assert len(fuse(views, far, 32).vertices) == 0
 
 
+def test_a_view_with_a_speck_of_surface_takes_nothing_from_the_others(
+    views: list[DepthView], sphere: TriangleMesh
+) -> None:
+    """Open3D looks at every fourth pixel, and fails where none of those is wanted."""
+    first = views[0]
+    middle = first.z_depth[60, 80]
+    speck = np.zeros_like(first.z_depth)
+    speck[57:60, 77:80] = middle
+    small = DepthView(LENS, first.world_from_camera, first.rgb, speck)
+    assert small.smooth_mask().any()
+    fused = fuse([small, *views], bounds_around(CENTER), RESOLUTION)
+    assert len(fused.vertices) == pytest.approx(len(sphere.vertices), rel=0.05)
+
+
 def test_the_store_gives_back_what_it_was_given(views: list[DepthView], tmp_path: Path) -> None:
     store = ViewStore(tmp_path / "views")
     for view in views:

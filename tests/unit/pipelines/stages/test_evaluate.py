@@ -31,7 +31,7 @@ from pipelines.stages.evaluate import (
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
-TEST_TIME = {"pose_steps": 40, "appearance_steps": 30, "rays_per_step": 256}
+TEST_TIME = {"pose_steps": 100, "appearance_steps": 30, "rays_per_step": 256}
 FITTED: dict[str, Any] = {"fit_poses": True, "fit_appearance": True, "test_time": TEST_TIME}
 
 

@@ -13,8 +13,8 @@ from PIL import Image
 from pipelines.cameras_file import CamerasFile
 from pipelines.errors import Cancelled, PosesError
 from pipelines.options import PosesOptions
-from pipelines.orientation import align_points
 from pipelines.ply import read_ply
+from pipelines.sample.align import similarity
 from pipelines.stage import StageContext
 from pipelines.stages.poses import run
 from pipelines.workspace import Workspace
@@ -59,7 +59,7 @@ def test_cameras_match_the_truth_up_to_a_similarity(job: tuple[Path, Any, Any]) 
     cameras = CamerasFile.load(job[0] / ".partial/poses/cameras.json")
     poses = np.array([image.world_from_camera for image in cameras.images])
     truth = np.delete(arc_poses(12), 2, axis=0)
-    move = align_points(poses[:, :, 3], truth[:, :, 3])
+    move = similarity(poses[:, :, 3], truth[:, :, 3])
     extent = np.ptp(truth[:, :, 3], axis=0).max()
     errors = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - truth[:, :, 3], axis=1)
     assert errors.mean() < 0.01 * extent
@@ -94,7 +94,7 @@ def test_sparse_points_lie_on_the_walls(job: tuple[Path, Any, Any]) -> None:
     poses = np.array([image.world_from_camera for image in cameras.images])
     truth = np.delete(arc_poses(12), 2, axis=0)
     sparse = read_ply(job[0] / ".partial/poses/points.ply")
-    move = align_points(poses[:, :, 3], truth[:, :, 3])
+    move = similarity(poses[:, :, 3], truth[:, :, 3])
     points = move.apply_to_points(sparse.points.astype(np.float64))
     assert len(points) > 100
     assert np.median(np.abs(points).min(axis=1)) < 0.02

@@ -47,7 +47,7 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
     assert set(report["timings"]) == {f"{name}_s" for name in ran}
     assert all(seconds > 0 for seconds in report["timings"].values())
     assert set(report["options"]) == ran
-    assert report["options"]["train"]["max_steps"] == 200
+    assert report["options"]["train"]["max_steps"] == 400
     assert report["versions"]["torch"]
     assert {item["name"] for item in report["artifacts"]} == {
         "cameras.json",

@@ -19,7 +19,7 @@ from tests.unit.pipelines.stages import tiny_job
 
 def test_summary_says_what_was_trained(trained_job: Workspace) -> None:
     summary = trained_job.manifest("train")["summary"]
-    assert summary["num_steps"] == 200
+    assert summary["num_steps"] == 400
     assert summary["num_train"] + summary["num_test"] == tiny_job.NUM_IMAGES
     assert summary["num_test"] == 5
     assert (summary["width"], summary["height"]) == (36, 64)
@@ -63,7 +63,7 @@ def test_cameras_carry_the_corrections_of_training_images_only(trained_job: Work
 
 def test_previews_are_small_pictures_of_training(trained_job: Workspace) -> None:
     names = sorted(path.name for path in (trained_job.stage("train") / "previews").iterdir())
-    assert names == ["step_000100.jpg", "step_000200.jpg"]
+    assert names == ["step_000200.jpg", "step_000400.jpg"]
     with Image.open(trained_job.stage("train") / "previews" / names[0]) as picture:
         assert picture.size == (36, 64)
 
@@ -77,7 +77,7 @@ def test_a_cancel_ends_training_at_the_next_step(tmp_path: Path) -> None:
     )
     with pytest.raises(Cancelled):
         tiny_job.run_with(workspace, "train", hooks)
-    assert messages[-1].startswith("step 3/200, ")
+    assert messages[-1].startswith("step 3/400, ")
     assert messages[-1].endswith(" dB")
     assert not workspace.stage("train").exists()
 

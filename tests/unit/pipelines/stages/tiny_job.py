@@ -21,10 +21,10 @@ LONG_SIDE = 64
 _GRID = {"num_levels": 4, "log2_table_size": 12, "max_res": 64}
 OPTIONS: dict[str, Any] = {
     "train": {
-        "max_steps": 200,
+        "max_steps": 400,
         "rays_per_step": 512,
         "device": "cpu",
-        "preview_every_steps": 100,
+        "preview_every_steps": 200,
         "model": {
             "num_proposal_samples": [32],
             "num_nerf_samples": 16,
