@@ -25,10 +25,10 @@ from pipelines.nerf.kernels.hash_lanes import (
     ENTRY_BYTES,
     NUM_FEATURES,
     PLACE_ROWS,
-    _cells,
-    _corner_entries,
-    _gather,
+    corner_entries,
     encode_columns,
+    gather_pairs,
+    locate_cells,
     scatter_columns,
 )
 from pipelines.nerf.kernels.lanes import INT32, LANES, Lanes
@@ -67,9 +67,9 @@ def _generate_encode(dense: bool) -> Callable[..., Any]:
         lanes = Lanes(builder)
         cells_per_side = builder.trunc(resolution, INT32)
         row_bytes = ir.Constant(points.type, ROW_BYTES)
-        cells, fractions = _cells(lanes, points, row_bytes, cells_per_side)
-        entries = _corner_entries(lanes, cells, builder.trunc(step, INT32), dense)
-        corners = [_gather(lanes, table, entry) for entry in entries]
+        cells, fractions = locate_cells(lanes, points, row_bytes, cells_per_side)
+        entries = corner_entries(lanes, cells, builder.trunc(step, INT32), dense)
+        corners = [gather_pairs(lanes, table, entry) for entry in entries]
         scale = lanes.splat(builder.sitofp(cells_per_side, ir.FloatType()))
         for feature in range(NUM_FEATURES):
             values = [corner[feature] for corner in corners]

@@ -34,7 +34,9 @@ def _int32(value: int) -> int:
     return value - 2**32 if value >= 2**31 else value
 
 
-def _cells(lanes: Lanes, points: Any, row_bytes: Any, resolution: Any) -> tuple[list[Any], ...]:
+def locate_cells(
+    lanes: Lanes, points: Any, row_bytes: Any, resolution: Any
+) -> tuple[list[Any], ...]:
     """Cells (int32) and places inside them of 16 points; the guards of the plain twin."""
     build = lanes.builder
     scale = lanes.splat(build.sitofp(resolution, ir.FloatType()))
@@ -55,7 +57,7 @@ def _cells(lanes: Lanes, points: Any, row_bytes: Any, resolution: Any) -> tuple[
     return cells, fractions
 
 
-def _corner_entries(lanes: Lanes, cells: list[Any], step: Any, dense: bool) -> list[Any]:
+def corner_entries(lanes: Lanes, cells: list[Any], step: Any, dense: bool) -> list[Any]:
     """Entries, within the level, of the eight corners, x fastest; int32.
 
     step: cells per side + 1 of a dense level, the mask of a hashed one.
@@ -96,7 +98,7 @@ def _entry_address(lanes: Lanes, table: Any, entry: Any) -> Any:
     return build.add(table, build.mul(build.zext(entry, INT64), ir.Constant(INT64, ENTRY_BYTES)))
 
 
-def _gather(lanes: Lanes, table: Any, entries: Any) -> tuple[Any, Any]:
+def gather_pairs(lanes: Lanes, table: Any, entries: Any) -> tuple[Any, Any]:
     """Both features of 16 entries."""
     build = lanes.builder
     half = LANES // 2
@@ -118,11 +120,11 @@ def _generate_encode(dense: bool) -> Callable[..., Any]:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         points, row_bytes, table, resolution, step, out, out_row_bytes = arguments
         lanes = Lanes(builder)
-        cells, fractions = _cells(lanes, points, row_bytes, builder.trunc(resolution, INT32))
-        entries = _corner_entries(lanes, cells, builder.trunc(step, INT32), dense)
+        cells, fractions = locate_cells(lanes, points, row_bytes, builder.trunc(resolution, INT32))
+        entries = corner_entries(lanes, cells, builder.trunc(step, INT32), dense)
         sums: list[Any] = []
         for entry, weight in zip(entries, _corner_weights(lanes, fractions), strict=True):
-            terms = [lanes.mul(weight, value) for value in _gather(lanes, table, entry)]
+            terms = [lanes.mul(weight, value) for value in gather_pairs(lanes, table, entry)]
             sums = [lanes.add(s, t) for s, t in zip(sums, terms, strict=True)] if sums else terms
         lanes.store(sums[0], out)
         lanes.store(sums[1], builder.add(out, out_row_bytes))
@@ -175,8 +177,8 @@ def _generate_locate(dense: bool) -> Callable[..., Any]:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         points, row_bytes, resolution, step, out, out_row_bytes = arguments
         lanes = Lanes(builder)
-        cells, fractions = _cells(lanes, points, row_bytes, builder.trunc(resolution, INT32))
-        entries = _corner_entries(lanes, cells, builder.trunc(step, INT32), dense)
+        cells, fractions = locate_cells(lanes, points, row_bytes, builder.trunc(resolution, INT32))
+        entries = corner_entries(lanes, cells, builder.trunc(step, INT32), dense)
         # Two numbers tell cells apart, as there are at most 2^16 per side.
         plane = builder.or_(cells[0], builder.shl(cells[1], lanes.ints(16)))
         for row in (*fractions, plane, cells[2], *entries):
