@@ -3,8 +3,10 @@
 What the bound of a device is worth: the least traffic that the chosen kernels need, with every
 tensor between two kernels written once and read once. Symbols: R rays, S samples, P = R S points,
 L levels, F features. Counted apart: `hbm_bytes` of tensors too large for the cache, `sectors` of
-32 bytes that scattered reads and additions of a hash grid ask of the L2 cache (the two corners
-along x lie in one sector, as a rule: four a level and point), `flops` of matrix products.
+32 bytes that scattered reads and additions of a hash grid ask of the L2 cache, `flops` of matrix
+products. What a grid's kernels do for a level and point is read off their machine code, which
+`tests/unit/pipelines/nerf/gpu/test_compile.py` pins: eight loads of two features, and eight
+additions of two features on GPUs that have those (sm_90 on), sixteen of one elsewhere.
 """
 
 from __future__ import annotations
@@ -13,15 +15,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from pipelines.nerf.config import HashGridConfig, NerfactoConfig
+from pipelines.nerf.config import HashGridConfig, NerfactoConfig, ProposalConfig
 from pipelines.nerf.encodings import level_layout
 
 SECTOR = 32
-SECTORS_PER_LEVEL = 4
+CORNERS = 8
 FLOAT, HALF = 4, 2
-ADAM_PASSES = 10
+PAIRED_ADDITIONS_FROM = 90
+"""The architecture from which one addition takes two neighbouring float32."""
+ADAM_PASSES = 11
 """The gradient is set to zero (1 write), checked and written back (2); Adam reads it with parameter
-and moments (4) and writes the latter three back (3)."""
+and moments (4), and writes these and, divided by the loss scale, the gradient (4)."""
 PER_SAMPLE_PASSES = 24
 """float32 values per sample that weights, resampling, positions and losses move, forward; the
 backward pass moves about as many. Plain PyTorch, one kernel per operation."""
@@ -29,20 +33,24 @@ backward pass moves about as many. Plain PyTorch, one kernel per operation."""
 
 @dataclass(frozen=True)
 class Device:
-    """What a device can do at best, as its maker states it: bytes/s and dense float16 flop/s."""
+    """What a device can do at best, as its maker states it: bytes/s and dense float16 flop/s.
+
+    arch: its compute capability, 90 for 9.0.
+    """
 
     name: str
     hbm_bytes_per_s: float
     half_flops_per_s: float
+    arch: int = PAIRED_ADDITIONS_FROM
 
 
 DEVICES = (
     Device("H200", 4.8e12, 989e12),
     Device("H100", 3.35e12, 989e12),
-    Device("A100", 2.04e12, 312e12),
-    Device("RTX 4090", 1.008e12, 165e12),
-    Device("L4", 0.3e12, 121e12),
-    Device("T4", 0.32e12, 65e12),
+    Device("A100", 2.04e12, 312e12, 80),
+    Device("RTX 4090", 1.008e12, 165e12, 89),
+    Device("L4", 0.3e12, 121e12, 89),
+    Device("T4", 0.32e12, 65e12, 75),
 )
 
 
@@ -82,15 +90,41 @@ def mlp_bytes(points: int, widths: Sequence[int], *, fused: bool) -> float:
     return HALF * points * float(ends if fused else ends + 4 * sum(widths[1:-1]))
 
 
-def grid_work(phase: str, points: int, grid: HashGridConfig, *, directions: int) -> Work:
-    """One pass over a grid: points read once a level, features moved, corners asked for.
+def read_sectors(features: int, entry_bytes: int) -> float:
+    """Sectors that the reads of eight corners ask of L2, for one level and point.
 
-    directions: 1 forward, 2 for both gradients, of which each asks for the corners again.
+    The corners along x are neighbours, on hashed levels nearly as often as on dense ones (x and
+    x + 1 differ in their lowest bits alone, and the hash leaves these together): a second sector is
+    needed where the first corner is the last entry of its own, one time in (sector / entry).
     """
-    width = grid.num_levels * grid.features_per_level
-    moved = points * FLOAT * (3.0 + width) * directions
-    sectors = float(points * grid.num_levels * SECTORS_PER_LEVEL * directions)
-    return Work(phase, moved, sectors, 0.0)
+    return CORNERS / 2 * (1.0 + min(1.0, features * entry_bytes / SECTOR))
+
+
+def added_sectors(features: int, arch: int) -> float:
+    """Sectors that the additions to eight corners ask of L2, which does them one by one."""
+    at_once = 2 if arch >= PAIRED_ADDITIONS_FROM and features % 2 == 0 else 1
+    return float(CORNERS * features // at_once)
+
+
+def grid_forward(phase: str, points: int, grid: HashGridConfig) -> Work:
+    """Points read once, float16 features written, corners asked for."""
+    features = grid.features_per_level
+    moved = points * (3.0 * FLOAT + HALF * grid.num_levels * features)
+    return Work(phase, moved, points * grid.num_levels * read_sectors(features, FLOAT), 0.0)
+
+
+def grid_backward(
+    phase: str, points: int, grid: HashGridConfig, *, to_points: bool, arch: int
+) -> Work:
+    """Points and float16 gradients read, the table's additions; and the same again with reads of
+    the corners for the gradient of the points, where it is wanted."""
+    features, num_levels = grid.features_per_level, grid.num_levels
+    moved = points * (3.0 * FLOAT + HALF * num_levels * features)
+    sectors = added_sectors(features, arch)
+    if to_points:
+        moved += moved + points * 3.0 * FLOAT
+        sectors += read_sectors(features, FLOAT)
+    return Work(phase, moved, points * num_levels * sectors, 0.0)
 
 
 def grid_entries(grid: HashGridConfig) -> int:
@@ -111,15 +145,15 @@ def forward_work(config: NerfactoConfig, rays: int, *, fused: bool) -> list[Work
     works = []
     proposal_points = 0
     for index, count in enumerate(config.num_proposal_samples):
-        proposal = config.proposals[0 if config.share_proposal_network else index]
+        proposal = _proposal(config, index)
         points = rays * count
         proposal_points += points
         width = proposal.grid.num_levels * proposal.grid.features_per_level
         widths = (width, proposal.hidden_dim, 1)
-        works.append(grid_work(f"proposal grid {index + 1}", points, proposal.grid, directions=1))
+        works.append(grid_forward(f"proposal grid {index + 1}", points, proposal.grid))
         works.append(_mlp(f"proposal network {index + 1}", points, (widths,), fused=fused))
     points = rays * config.num_nerf_samples
-    works.append(grid_work("field grid", points, config.grid, directions=1))
+    works.append(grid_forward("field grid", points, config.grid))
     works.append(_mlp("field networks", points, mlp_widths(config), fused=fused))
     per_sample = float(FLOAT * PER_SAMPLE_PASSES * (proposal_points + points))
     works.append(Work("per-sample operations", per_sample, 0.0, 0.0))
@@ -127,35 +161,46 @@ def forward_work(config: NerfactoConfig, rays: int, *, fused: bool) -> list[Work
 
 
 def step_work(
-    config: NerfactoConfig, rays: int, *, update_proposals: bool, fused: bool = False
+    config: NerfactoConfig,
+    rays: int,
+    *,
+    update_proposals: bool,
+    fused: bool = False,
+    arch: int = PAIRED_ADDITIONS_FROM,
 ) -> list[Work]:
     """A whole training step, by phase.
 
     update_proposals: whether the proposal networks learn in it. fused: the networks' hidden layers
-    stay on the chip.
+    stay on the chip. arch: compute capability, for how many features an addition takes.
     """
-    forward = forward_work(config, rays, fused=fused)
-    works = list(forward)
+    works = forward_work(config, rays, fused=fused)
     entries = float(grid_entries(config.grid))
-    for work in forward:
+    moves_cameras = config.camera_mode != "off"
+    for work in list(works):
         if work.phase.startswith("proposal") and not update_proposals:
             continue
-        # Backward: inputs and gradients are read, gradients written; products for inputs and
-        # weights. A proposal's grid has a gradient for its table alone.
-        factor = 1.0 if work.phase.startswith("proposal grid") else 2.0
-        works.append(
-            Work(
-                f"{work.phase}, backward",
-                factor * work.hbm_bytes,
-                factor * work.sectors,
-                2.0 * work.flops,
-            )
-        )
+        phase = f"{work.phase}, backward"
+        if work.phase.startswith("proposal grid"):
+            index = int(work.phase.split()[-1]) - 1
+            points, grid = rays * config.num_proposal_samples[index], _proposal(config, index).grid
+            # Where the proposals' samples lie passes no gradient to the cameras.
+            works.append(grid_backward(phase, points, grid, to_points=False, arch=arch))
+        elif work.phase == "field grid":
+            points, grid = rays * config.num_nerf_samples, config.grid
+            works.append(grid_backward(phase, points, grid, to_points=moves_cameras, arch=arch))
+        else:
+            # Inputs and gradients are read, gradients written; products for inputs and weights.
+            works.append(Work(phase, 2.0 * work.hbm_bytes, 0.0, 2.0 * work.flops))
     if update_proposals:
         networks = 1 if config.share_proposal_network else len(config.num_proposal_samples)
         entries += sum(grid_entries(proposal.grid) for proposal in config.proposals[:networks])
     works.append(Work("gradients and Adam", FLOAT * ADAM_PASSES * entries, 0.0, 0.0))
     return works
+
+
+def _proposal(config: NerfactoConfig, index: int) -> ProposalConfig:
+    """The network of a round."""
+    return config.proposals[0 if config.share_proposal_network else index]
 
 
 def total(works: Sequence[Work], phase: str = "step") -> Work:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -31,6 +32,7 @@ from torch import Tensor, nn
 
 from pipelines.nerf.cameras import Cameras
 from pipelines.nerf.data import PixelSampler
+from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model, StepPlan
 from pipelines.nerf.models.nerfacto import Nerfacto
 
@@ -61,7 +63,10 @@ def capturable_adam(
     if device.type != "cuda":
         return torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
     held = torch.tensor(lr, dtype=torch.float32, device=device)
-    return torch.optim.Adam(parameters, lr=held, eps=eps, fused=True, capturable=True)
+    adam = torch.optim.Adam(parameters, lr=held, eps=eps, fused=True, capturable=True)
+    # torch would warn at each optimiser's first step, which is never captured.
+    adam._warned_capturable_if_run_uncaptured = True
+    return adam
 
 
 def _hold_on_device(optimizer: torch.optim.Adam, device: torch.device) -> None:
@@ -88,13 +93,23 @@ def loss_scaler(device: torch.device, rays_per_step: int) -> torch.amp.GradScale
     return torch.amp.GradScaler(device.type, scale, growth_interval=NEVER, enabled=on_gpu)
 
 
+@lru_cache
+def _stream_of(device: torch.device) -> torch.cuda.Stream:
+    """The stream of all steps on a device.
+
+    One for every `TrainingStep`: memory is kept by stream, and autograd keeps a parameter's stream
+    for as long as some graph holds it; one of another stream would break a capture.
+    """
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+
+
 def can_capture(model: Model, device: torch.device) -> bool:
     """Whether the steps of a model can be CUDA graphs: on a GPU, and of a method without host."""
     return device.type == "cuda" and isinstance(model, Nerfacto)
 
 
 @dataclass(frozen=True)
-class _Kind:
+class Kind:
     """What distinguishes one graph from another."""
 
     update_proposals: bool
@@ -134,7 +149,7 @@ class TrainingStep:
         self.device = cameras.focal.device
         self.captures = can_capture(model, self.device) and capture is not False
         on_gpu = self.device.type == "cuda"
-        self._stream = torch.cuda.Stream(self.device) if on_gpu else None  # type: ignore[no-untyped-call]
+        self._stream = _stream_of(self.device) if on_gpu else None
         self._fed: tuple[Tensor, Tensor, Tensor] | None = None
         if sampler.device.type != self.device.type:
             self._fed = (
@@ -142,14 +157,14 @@ class TrainingStep:
                 torch.zeros(rays_per_step, 2, device=self.device),
                 torch.zeros(rays_per_step, 3, device=self.device),
             )
-        if self.captures:
+        if on_gpu:
             for optimizer in self.optimizers.values():
                 _hold_on_device(optimizer, self.device)
         self._exponent = torch.ones((), dtype=torch.float32, device=self.device)
         self._values = torch.zeros(MAX_TERMS, dtype=torch.float32, device=self.device)
-        self._names: dict[_Kind, tuple[str, ...]] = {}
-        self._runs: dict[_Kind, int] = {}
-        self._graphs: dict[_Kind, torch.cuda.CUDAGraph] = {}
+        self._names: dict[Kind, tuple[str, ...]] = {}
+        self._runs: dict[Kind, int] = {}
+        self._graphs: dict[Kind, torch.cuda.CUDAGraph] = {}
         self._latest: tuple[int, tuple[str, ...]] = (-1, ())
 
     def run(self, step: int, rates: Mapping[str, float]) -> None:
@@ -159,7 +174,7 @@ class TrainingStep:
         """
         self._set_rates(rates)
         plan = self._model.plan_step(step, self._model_random)
-        kind = _Kind(plan.update_proposals, bool(plan.exponent != 1.0))
+        kind = Kind(plan.update_proposals, bool(plan.exponent != 1.0))
         if self._stream is None:
             self._run_as(kind, plan)
         else:
@@ -171,46 +186,59 @@ class TrainingStep:
         self._latest = (step, self._names[kind])
         self._model.finish_step(plan)
 
-    def _run_as(self, kind: _Kind, plan: StepPlan) -> None:
+    def _run_as(self, kind: Kind, plan: StepPlan) -> None:
         if self._fed is not None:
             drawn = self._sampler.draw(self._rays_per_step, self._pixel_random)
             for held, item in zip(self._fed, drawn, strict=True):
                 # From pinned memory, which the allocator keeps until the copy is done.
                 held.copy_(item.pin_memory(), non_blocking=True)
         if not self.captures:
-            self._optimise(kind, plan)
+            self.optimise(kind, plan)
             return
         self._exponent.fill_(plan.exponent)
         runs = self._runs[kind] = self._runs.get(kind, 0) + 1
         if runs <= EAGER_STEPS:
-            self._optimise(kind, self._with_held_exponent(kind, plan))
+            self.optimise(kind, self._with_held_exponent(kind, plan))
             return
         if kind not in self._graphs:
             self._graphs[kind] = self._captured(kind, self._with_held_exponent(kind, plan))
         self._graphs[kind].replay()
 
-    def _with_held_exponent(self, kind: _Kind, plan: StepPlan) -> StepPlan:
+    def _with_held_exponent(self, kind: Kind, plan: StepPlan) -> StepPlan:
         """The plan with a tensor for what differs from step to step of a kind."""
         held: Any = self._exponent
         return replace(plan, exponent=held) if kind.annealing else plan
 
-    def _captured(self, kind: _Kind, plan: StepPlan) -> torch.cuda.CUDAGraph:
-        """The step as a graph; capturing runs nothing."""
+    def _captured(self, kind: Kind, plan: StepPlan) -> torch.cuda.CUDAGraph:
+        """The step as a graph; capturing runs nothing. Raises NerfError `gpu_failed`."""
         graph = torch.cuda.CUDAGraph()
+        # Later releases find the generators by themselves.
+        register = getattr(graph, "register_generator_state", None)
         for generator in (self._pixel_random, self._model_random):
-            if generator.device.type == "cuda":
-                graph.register_generator_state(generator)
+            if generator.device.type == "cuda" and register is not None:
+                register(generator)
         pool = next(iter(self._graphs.values())).pool() if self._graphs else None
         torch.cuda.synchronize(self.device)
-        # Other threads of the process may go on using the GPU meanwhile.
-        with torch.cuda.graph(
-            graph, pool=pool, stream=self._stream, capture_error_mode="thread_local"
-        ):
-            self._optimise(kind, plan)
+        try:
+            # Other threads of the process may go on using the GPU meanwhile.
+            with torch.cuda.graph(
+                graph, pool=pool, stream=self._stream, capture_error_mode="thread_local"
+            ):
+                self.optimise(kind, plan)
+        except RuntimeError as error:
+            raise NerfError(
+                "gpu_failed",
+                f"The training step could not be captured as a CUDA graph on {self.device} with "
+                f"torch {torch.__version__}: {str(error).splitlines()[0]}",
+                "Set train.engine to plain.",
+            ) from error
         return graph
 
-    def _optimise(self, kind: _Kind, plan: StepPlan) -> None:
-        """The step itself: only work on the device, nothing that the host has to wait for."""
+    def optimise(self, kind: Kind, plan: StepPlan) -> None:
+        """The step itself: only work on the device, nothing that the host has to wait for.
+
+        Called by `run`, which decides whether it is captured, and by whoever checks it.
+        """
         model, device = self._model, self.device
         drawn = self._fed or self._sampler.draw(self._rays_per_step, self._pixel_random)
         index, pixels, colors = drawn

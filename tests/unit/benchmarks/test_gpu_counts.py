@@ -11,14 +11,18 @@ import torch
 
 from pipelines.nerf.config import HashGridConfig, NerfactoConfig
 from tests.benchmarks.gpu_counts import (
+    SECTOR,
     Device,
     Work,
+    added_sectors,
     forward_work,
+    grid_backward,
     grid_entries,
-    grid_work,
+    grid_forward,
     known_device,
     mlp_bytes,
     mlp_flops,
+    read_sectors,
     step_work,
     total,
 )
@@ -37,11 +41,39 @@ def test_a_fused_network_moves_its_ends_alone() -> None:
     assert mlp_bytes(5, (32, 64, 16), fused=False) == 2 * 5 * (32 + 4 * 64 + 16)
 
 
-def test_a_grid_asks_for_four_sectors_a_level_and_point() -> None:
-    grid = HashGridConfig(num_levels=5, min_res=16, max_res=128, log2_table_size=17)
-    work = grid_work("grid", 7, grid, directions=1)
-    assert work.sectors == 7 * 5 * 4
-    assert work.hbm_bytes == 7 * 4 * (3 + 10)
+GRID = HashGridConfig(num_levels=5, min_res=16, max_res=128, log2_table_size=17)
+
+
+def test_reads_of_corners_share_sectors_along_x() -> None:
+    """Counted: for every start x of a pair of neighbours, the sectors that hold both."""
+    entries = SECTOR // 8  # two float32 each
+    sectors = [len({x // entries, (x + 1) // entries}) for x in range(64)]
+    assert read_sectors(2, 4) == pytest.approx(4 * sum(sectors) / 64)
+    # A hashed level: the other axes change which entries these are, not how far they are apart.
+    mask, other = (1 << 12) - 1, 2654435761 * 77 ^ 805459861 * 13
+    hashed = [
+        len({((x ^ other) & mask) // entries, (((x + 1) ^ other) & mask) // entries})
+        for x in range(64)
+    ]
+    assert read_sectors(2, 4) == pytest.approx(4 * sum(hashed) / 64)
+
+
+def test_additions_take_two_features_where_the_gpu_can() -> None:
+    assert added_sectors(2, 90) == 8
+    assert added_sectors(2, 80) == 16
+    assert added_sectors(3, 90) == 24
+
+
+def test_a_grid_moves_its_points_and_features_once_each_way() -> None:
+    forward = grid_forward("grid", 7, GRID)
+    assert forward.sectors == 7 * 5 * read_sectors(2, 4)
+    assert forward.hbm_bytes == 7 * (3 * 4 + 10 * 2)
+    table = grid_backward("grid", 7, GRID, to_points=False, arch=90)
+    assert table.sectors == 7 * 5 * 8
+    assert table.hbm_bytes == forward.hbm_bytes
+    both = grid_backward("grid", 7, GRID, to_points=True, arch=90)
+    assert both.sectors == table.sectors + forward.sectors
+    assert both.hbm_bytes == 2 * table.hbm_bytes + 7 * 3 * 4
 
 
 def test_entries_count_dense_levels_by_their_vertices() -> None:

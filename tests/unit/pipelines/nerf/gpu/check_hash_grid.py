@@ -170,3 +170,31 @@ def test_another_shape_or_type_is_refused_by_name(case: str) -> None:
     with pytest.raises(NerfError, match="hash grid cannot be read") as raised:
         hash_encode_triton(places, entries, *levels, lookup=lookup)
     assert raised.value.code == "bad_config"
+
+
+@pytest.mark.parametrize("num_features", [1, 2])
+def test_within_an_autocast_features_and_their_gradients_are_rounded_once(
+    num_features: int,
+) -> None:
+    points, table, levels = drawn(MIXED, 40, num_features, torch.float32)
+    incoming = torch.randn(40, 3 * num_features, device=DEVICE).half()
+    place, entries = points.clone().requires_grad_(), table.clone().requires_grad_()
+    with torch.autocast(DEVICE.type, torch.float16):
+        found = hash_encode_triton(place, entries, *levels)
+    ours = torch.autograd.grad(found, (place, entries), incoming)
+    whole = hash_encode_triton(place, entries, *levels)
+    theirs = torch.autograd.grad(whole, (place, entries), incoming.float())
+    assert torch.equal(found, whole.half())
+    for half, full in zip(ours, theirs, strict=True):
+        assert half.dtype == torch.float32
+        torch.testing.assert_close(half, full, rtol=1e-5, atol=1e-5)
+
+
+def test_a_gradient_that_begins_between_two_pairs_is_read_right() -> None:
+    points, table, levels = drawn(ONLY_DENSE, 1, 2, torch.float32)
+    entries = table.clone().requires_grad_()
+    incoming = torch.randn(5, device=DEVICE)
+    found = hash_encode_triton(points, entries, *levels)
+    (shifted,) = torch.autograd.grad(found, entries, incoming[1:][None], retain_graph=True)
+    (own,) = torch.autograd.grad(found, entries, incoming[1:].clone()[None])
+    torch.testing.assert_close(shifted, own)

@@ -1,78 +1,78 @@
-"""Compiles every Triton kernel for a GPU that need not be there; run by `test_kernels`.
+"""Compiles the Triton kernels for GPUs that need not be there; run by `test_compile`.
 
-    python -m tests.unit.pipelines.nerf.gpu.compile_kernels 80 90
+    python -m tests.unit.pipelines.nerf.gpu.compile_kernels 90 75 80 120
 
-For each architecture and kernel prints what ptxas made of it as JSON: {"kernel", "capability",
-"shared_bytes", "ptx_loads_of_64_bits"}.
+For the first architecture every kernel that training and rendering launch with the paper's sizes,
+for the others the largest. Each kernel becomes one line of JSON: the fields of
+`pretend_gpu.Compiled`, with "arch" and "resident_share".
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from typing import Any
 
-import triton
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
+import torch
+from torch import Tensor
 
-from pipelines.nerf.gpu import hash_grid, mlp
+from pipelines.nerf.config import NerfactoConfig
+from pipelines.nerf.encodings import HashGrid
+from pipelines.nerf.fields import MLP
+from pipelines.nerf.gpu.hash_grid import hash_encode_triton
+from pipelines.nerf.gpu.mlp import fused_mlp
+from tests.unit.pipelines.nerf.gpu.pretend_gpu import PretendGpu
 
-POINTERS_TO_INTEGERS = {"resolutions": "*i64", "offsets": "*i64", "dense": "*i1"}
-NUMBERS = ("num_points", "num_levels")
-GRID = {"F": 2, "L": 16, "IS_PAIRED": True, "IS_HALF": False, "B": hash_grid.POINTS_PER_PROGRAM}
+NUM_POINTS = 4096
+FUSED_FROM = 80
+"""`mlp.has_room`: older matrix units are not Triton's."""
+PAPER = NerfactoConfig()
 
 
-def kernels() -> list[tuple[Any, dict[str, Any], int, str]]:
-    """(kernel, values of its constants, warps, type of the table)."""
-    found: list[tuple[Any, dict[str, Any], int, str]] = []
-    for kernel in (
-        hash_grid._forward_kernel,
-        hash_grid._table_gradient_kernel,
-        hash_grid._point_gradient_kernel,
-    ):
-        found.append((kernel, GRID, hash_grid.NUM_WARPS, "*i64"))
-    found.append(
-        (hash_grid._forward_kernel, {**GRID, "IS_HALF": True}, hash_grid.NUM_WARPS, "*i32")
-    )
+def encode(grid: HashGrid, points: Tensor, lookup: Tensor | None = None) -> Tensor:
+    """What `HashGrid.forward` asks for on a GPU."""
+    levels = (grid.resolutions, grid.dense, grid.offsets)
+    return hash_encode_triton(points, grid.table, *levels, lookup=lookup)
+
+
+def learn(grid: HashGrid, points: Tensor) -> None:
+    """Forward and backward, as a training step does it; points that require a gradient get one."""
+    with torch.autocast("cpu", torch.float16):
+        features = encode(grid, points)
+    torch.autograd.backward(features.sum())
+
+
+def launch_all() -> None:
+    """Every launch of training and rendering, with the paper's sizes."""
+    points = torch.zeros(NUM_POINTS, 3)
+    proposal = HashGrid(PAPER.proposals[0].grid)
+    learn(proposal, points)
+    learn(HashGrid(PAPER.grid), points.clone().requires_grad_())
+    for grid in (proposal, HashGrid(PAPER.grid)):
+        encode(grid, points, grid.table.detach().half())
     for widths in [(10, 16, 1), (32, 64, 16), (63, 64, 64, 3)]:
-        sizes = {**mlp._sizes(widths), "IS_DEEP": len(widths) == 4, "IS_HALF": True}
-        backward = {"WANTS_VALUES": True, "NUM_SUMS": 1000, "TILES": 8, "B": mlp.BACKWARD_TILE}
-        found.append(
-            (mlp._forward_kernel, {**sizes, "B": mlp.FORWARD_TILE}, mlp.FORWARD_WARPS, "*fp32")
-        )
-        found.append((mlp._backward_kernel, {**sizes, **backward}, mlp.BACKWARD_WARPS, "*fp32"))
-    return found
+        values = torch.zeros(NUM_POINTS, widths[0], requires_grad=True)
+        torch.autograd.backward(fused_mlp(values, MLP(*widths).layers).sum())
 
 
-def compiled(kernel: Any, constants: dict[str, Any], warps: int, table: str, arch: int) -> Any:
-    """The kernel for an architecture, down to machine code."""
-    signature = {}
-    for name in kernel.arg_names:
-        if name.isupper():
-            signature[name] = "constexpr"
-        elif name in NUMBERS:
-            signature[name] = "i32"
-        else:
-            signature[name] = POINTERS_TO_INTEGERS.get(name, table if name == "table" else "*fp32")
-    chosen = {name: value for name, value in constants.items() if name in signature}
-    source = ASTSource(fn=kernel, signature=signature, constexprs=chosen)
-    return triton.compile(source, target=GPUTarget("cuda", arch, 32), options={"num_warps": warps})
+def launch_largest(arch: int) -> None:
+    """Both gradients of the field's grid; of the networks the deepest."""
+    learn(HashGrid(PAPER.grid), torch.zeros(NUM_POINTS, 3, requires_grad=True))
+    if arch >= FUSED_FROM:
+        with torch.no_grad():
+            fused_mlp(torch.zeros(NUM_POINTS, 63), MLP(63, 64, 64, 3).layers)
 
 
 def main() -> None:
     """Compile and print."""
-    for arch in map(int, sys.argv[1:]):
-        for kernel, constants, warps, table in kernels():
-            made = compiled(kernel, constants, warps, table, arch)
-            assert len(made.asm["cubin"]) > 0
-            values = {
-                "kernel": kernel.__name__,
-                "capability": arch,
-                "shared_bytes": made.metadata.shared,
-                "ptx_loads_of_64_bits": made.asm["ptx"].count("ld.global.b64"),
-            }
-            print(json.dumps(values))
+    for index, arch in enumerate(map(int, sys.argv[1:])):
+        with PretendGpu(arch) as gpu:
+            if index == 0:
+                launch_all()
+            else:
+                launch_largest(arch)
+        for made in gpu.compiled:
+            share = made.resident_share(arch)
+            print(json.dumps({**vars(made), "arch": arch, "resident_share": share}))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ other test sees interpreted kernels. Where there is a GPU the same checks run co
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import subprocess
 import sys
@@ -23,11 +22,6 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[4]
 CHECKS = sorted(HERE.glob("check_*.py"))
 LIMIT_S = 300
-
-
-SHARED_BYTES = 99 * 1024
-"""Shared memory that one block may have on sm_86 and sm_89, the least from Ampere on. Source: CUDA
-C++ programming guide, "Technical specifications per compute capability"."""
 
 
 def run_checks(*, interpreted: bool) -> None:
@@ -60,28 +54,6 @@ def test_interpreted_kernels_agree_with_the_plain_definitions() -> None:
     require_triton()
     assert CHECKS
     run_checks(interpreted=True)
-
-
-def test_kernels_compile_for_gpus_and_fit_their_shared_memory(tmp_path: Path) -> None:
-    require_triton()
-    environment = dict(os.environ, OMP_NUM_THREADS="1", TRITON_CACHE_DIR=str(tmp_path))
-    environment.pop("TRITON_INTERPRET", None)
-    module = "tests.unit.pipelines.nerf.gpu.compile_kernels"
-    answer = subprocess.run(
-        [sys.executable, "-m", module, "86"],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-    )
-    assert answer.returncode == 0, answer.stderr[-4000:]
-    made = [json.loads(line) for line in answer.stdout.splitlines()]
-    assert len(made) == 10
-    assert all(item["shared_bytes"] <= SHARED_BYTES for item in made)
-    # Eight corners of two features by one load each, beside three numbers of the level.
-    paired = next(item for item in made if item["kernel"] == "_forward_kernel")
-    assert paired["ptx_loads_of_64_bits"] >= 8 + 3
 
 
 @pytest.mark.gpu

@@ -139,7 +139,7 @@ def test_an_exponent_held_in_a_tensor_draws_the_samples_of_the_number(exponent: 
     held: Tensor = torch.tensor(exponent)
 
     def edges(power: float | Tensor) -> list[Tensor]:
-        chosen = replace(plan, exponent=power)  # type: ignore[arg-type]
+        chosen = replace(plan, exponent=power)
         random = torch.Generator().manual_seed(1)
         return [s.t_edges for s in model(rays, plan=chosen, generator=random)["samples"]]
 

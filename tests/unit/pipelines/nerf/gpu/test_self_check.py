@@ -1,0 +1,93 @@
+"""The check that decides whether the GPU engine is trusted, on the CPU with its engines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from pipelines.nerf.config import TrainConfig
+from pipelines.nerf.gpu import self_check
+from pipelines.nerf.gpu.self_check import engine_problem, relative_gap
+from pipelines.nerf.models.nerfacto import Nerfacto
+from tests.unit.pipelines.nerf.toy_scene import tiny_config
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(self_check, "NUM_RAYS", 32)
+    monkeypatch.setattr(self_check, "NUM_STEPS", 3)
+    engine_problem.cache_clear()
+
+
+def plain_config() -> TrainConfig:
+    """A run whose two engines are both PyTorch's, until a test changes one."""
+    config = tiny_config()
+    return replace(config, model=replace(config.model, position_encoding="fourier"))  # type: ignore[call-arg]
+
+
+def spoil_fast(monkeypatch: pytest.MonkeyPatch, change: Callable[[Nerfacto], object]) -> None:
+    """Change every model that is told to be fast."""
+
+    def set_engine(model: Nerfacto, engine: str) -> None:
+        model.engine = "plain"
+        if engine == "fast":
+            change(model)
+
+    monkeypatch.setattr(Nerfacto, "set_engine", set_engine)
+
+
+def test_engines_that_agree_are_no_problem() -> None:
+    before = torch.random.get_rng_state()
+    assert engine_problem(plain_config(), CPU) is None
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_a_wrong_gradient_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def half_too_much(gradient: Tensor) -> Tensor:
+        return 1.5 * gradient
+
+    def spoil(model: Nerfacto) -> None:
+        parameters = dict(model.named_parameters())
+        parameters["field.color_mlp.layers.0.weight"].register_hook(half_too_much)  # type: ignore[no-untyped-call]
+
+    spoil_fast(monkeypatch, spoil)
+    problem = engine_problem(plain_config(), CPU)
+    assert problem == "the gradient of field.color_mlp.layers.0.weight is off by 50 %"
+
+
+def test_a_gradient_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    spoil_fast(monkeypatch, lambda model: model.cameras_delta.requires_grad_(False))
+    problem = engine_problem(plain_config(), CPU)
+    assert problem == "only one engine has a gradient of cameras_delta.tangent"
+
+
+def test_wrong_values_are_told_as_losses(monkeypatch: pytest.MonkeyPatch) -> None:
+    def brighten(model: Nerfacto) -> None:
+        with torch.no_grad():
+            model.field.color_mlp.layers[-1].bias.add_(1.0)  # type: ignore[operator]
+
+    spoil_fast(monkeypatch, brighten)
+    problem = engine_problem(plain_config(), CPU)
+    assert problem is not None
+    assert problem.startswith("the colour loss of the first step is")
+
+
+def test_an_error_of_the_engine_is_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(model: Nerfacto) -> None:
+        raise RuntimeError("Failed to find C compiler.\nPlease specify one.")
+
+    spoil_fast(monkeypatch, fail)
+    assert engine_problem(plain_config(), CPU) == "RuntimeError: Failed to find C compiler."
+
+
+def test_gaps_are_relative_to_what_is_expected() -> None:
+    assert relative_gap(torch.tensor([3.0, 5.0]), torch.tensor([3.0, 4.0])) == pytest.approx(0.2)
+    assert relative_gap(torch.zeros(2), torch.zeros(2)) == 0.0
+    assert relative_gap(torch.ones(2), torch.zeros(2)) == float("inf")
+    assert not relative_gap(torch.tensor([float("nan")]), torch.ones(1)) <= 1.0
