@@ -1,55 +1,77 @@
 """The ladder of attempts at a reconstruction, with its progress and its checkpoint.
 
-First the planned pairs; where too few images register, all pairs; then relaxed thresholds. The
-attempt with most images wins. Features and matches stay in one database, the checkpoint.
+First the quick way (docs/poses.md has what was measured): features as coarse as the capture
+allows, the planned pairs, few trials, few adjustments. Where too few images register, COLMAP's own
+thorough way with all pairs, in a database of its own; then relaxed thresholds. The attempt with
+most images wins. The two databases, with features and matches, are the checkpoint.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+import statistics
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pipelines.options import PosesOptions
-from pipelines.sfm.pairs import Pairs, exhaustive_pairs, plan_pairs
+from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
 from pipelines.sfm.report import Attempt, Outcome, check_features
+from pipelines.sfm.retrieval import FEATURES_PER_IMAGE, image_vectors, retrieval_pairs
 from pipelines.sfm.source import Source, camera_groups
 from pipelines.sfm.turning import is_turning
 from pipelines.stage import StageContext
-from pipelines.tools.colmap import MapperSettings, Reconstructor, Watch
+from pipelines.tools.colmap import (
+    FeatureSettings,
+    MapperSettings,
+    Reconstructor,
+    Watch,
+    extraction_threads,
+)
 
 MAX_RETRY_IMAGES = 300
 """Beyond this, matching all pairs takes hours and is not tried."""
 
+NUM_PROBES = 5
+"""Images, spread over the capture, whose features are counted before the rest."""
+ENOUGH_FEATURES = 500
+"""Median of the probes from which images are not doubled before features are found."""
+
+_FORMAT = 2
+"""Of the checkpoint: raised where the same options give other databases."""
+
 Span = tuple[float, float]
-_FEATURES: Span = (0.0, 0.32)
-_MATCHING: Span = (0.32, 0.6)
-_MAPPING: Span = (0.6, 0.9)
-_RETRY_MATCHING: Span = (0.9, 0.94)
-_RETRY_MAPPING: Span = (0.94, 0.96)
-_RELAXED: Span = (0.96, 0.98)
+_FEATURES: Span = (0.0, 0.25)
+_MATCHING: Span = (0.25, 0.5)
+_MAPPING: Span = (0.5, 0.9)
+_RETRY_FEATURES: Span = (0.9, 0.92)
+_RETRY_MATCHING: Span = (0.92, 0.95)
+_RETRY_MAPPING: Span = (0.95, 0.97)
+_RELAXED: Span = (0.97, 0.98)
 
 
 class Checkpoint:
-    """The database, and which steps are complete in it: a retried attempt goes on from there.
+    """The databases, and which steps are complete in them: a retried attempt goes on from there.
 
-    A database without a state file, or made from other inputs or options, is thrown away.
+    `database` is that of the quick way, `thorough_database` that of the thorough one. Databases
+    without a state file, or made from other inputs or options, are thrown away.
     """
 
     def __init__(self, ctx: StageContext, source: Source, options: PosesOptions) -> None:
         self._ctx = ctx
         self._state_file = ctx.checkpoint / "state.json"
         self.database = ctx.checkpoint / "colmap.db"
+        self.thorough_database = ctx.checkpoint / "thorough.db"
         inputs = [
             (file, path.stat().st_size)
             for file, path in zip(source.files, source.paths, strict=True)
         ]
         wanted = options.model_dump(
-            include={"max_image_px", "num_features", "camera_model", "matcher"}
-            | {"sequential_overlap"}
+            include={"max_image_px", "num_features", "upsample", "camera_model", "matcher"}
+            | {"sequential_overlap", "retrieval_neighbours"}
         )
-        text = json.dumps([inputs, wanted, ctx.seed], sort_keys=True)
+        text = json.dumps([_FORMAT, inputs, wanted, ctx.seed], sort_keys=True)
         self._fingerprint = hashlib.sha256(text.encode()).hexdigest()
         self._steps: list[str] = []
         ctx.checkpoint.mkdir(parents=True, exist_ok=True)
@@ -59,11 +81,11 @@ class Checkpoint:
                 self._steps = list(state["steps"])
         if not self._steps:
             self._state_file.unlink(missing_ok=True)
-            for stale in ctx.checkpoint.glob("colmap.db*"):
+            for stale in (*ctx.checkpoint.glob("colmap.db*"), *ctx.checkpoint.glob("thorough.db*")):
                 stale.unlink()
 
     def has(self, step: str) -> bool:
-        """Whether that step is complete in the database."""
+        """Whether that step is complete in its database."""
         return step in self._steps
 
     def save(self, step: str) -> None:
@@ -138,63 +160,118 @@ class Ladder:
         Raises PosesError (no_features) before matching where images hold nothing to match.
         """
         num, options = len(self._source.files), self._options
-        matcher, pairs = plan_pairs(
-            num, options.matcher, options.sequential_overlap, is_video=self._source.is_video
-        )
+        matcher = choose_matcher(num, options.matcher, is_video=self._source.is_video)
         self._progress.aim(0.0, _MAPPING[1])
-        self._extract()
+        self._extract(_FEATURES, thorough=False)
         check_features(self._reconstructor.statistics(), options)
-        self._match(matcher, pairs, _MATCHING)
+        self._match(matcher, _MATCHING, thorough=False)
         if is_turning(self._reconstructor.statistics()):
             return Outcome((), self._reconstructor.statistics())
-        self._map(matcher, _MAPPING, relaxed=False)
-        if not self._is_enough() and matcher != "exhaustive" and num <= MAX_RETRY_IMAGES:
-            matcher = "exhaustive"
-            self._progress.aim(_RETRY_MATCHING[0], _RETRY_MAPPING[1])
-            self._match(matcher, exhaustive_pairs(num), _RETRY_MATCHING)
-            self._map(matcher, _RETRY_MAPPING, relaxed=False)
+        self._map(matcher, _MAPPING, MapperSettings(refine_principal_point=self._principal))
+        if not self._is_enough():
+            self._climb_thoroughly("exhaustive" if num <= MAX_RETRY_IMAGES else matcher)
+        return Outcome(tuple(self._attempts), self._reconstructor.statistics())
+
+    def _climb_thoroughly(self, matcher: str) -> None:
+        """COLMAP's own thoroughness, and where that does not do either, lower thresholds."""
+        self._reconstructor = self._reconstructor.on(self._checkpoint.thorough_database)
+        self._progress.aim(_RETRY_FEATURES[0], _RETRY_MAPPING[1])
+        self._extract(_RETRY_FEATURES, thorough=True)
+        self._match(matcher, _RETRY_MATCHING, thorough=True)
+        settings = MapperSettings(refine_principal_point=self._principal, thorough=True)
+        self._map(matcher, _RETRY_MAPPING, settings)
         if not self._is_enough():
             self._progress.aim(*_RELAXED)
-            self._map(matcher, _RELAXED, relaxed=True)
-        return Outcome(tuple(self._attempts), self._reconstructor.statistics())
+            self._map(matcher, _RELAXED, replace(settings, relaxed=True))
+
+    @property
+    def _principal(self) -> bool:
+        return self._options.refine_principal_point
 
     def _is_enough(self) -> bool:
         most = max(attempt.num_registered for attempt in self._attempts)
         return most >= self._options.retry_below_ratio * len(self._source.files)
 
-    def _extract(self) -> None:
-        if self._checkpoint.has("features"):
-            self._ctx.logger.info("features are in the checkpoint")
+    def _settings(self, *, upsample: bool) -> FeatureSettings:
+        options = self._options
+        wanted = FeatureSettings(
+            options.max_image_px, options.num_features, upsample, options.num_threads
+        )
+        threads = extraction_threads(wanted, options.memory_mb, _num_processors())
+        return replace(wanted, num_threads=threads)
+
+    def _must_upsample(self) -> bool:
+        """Whether images must be doubled to show enough features, from a few of them."""
+        if self._options.upsample != "auto":
+            return self._options.upsample == "on"
+        num = len(self._source.files)
+        probes = sorted({round(i * (num - 1) / (NUM_PROBES - 1)) for i in range(NUM_PROBES)})
+        self._ctx.progress(0.0, "looking at a few images")
+        counts = self._reconstructor.count_features(probes, self._settings(upsample=False))
+        self._ctx.logger.info("features of images %s without doubling: %s", probes, counts)
+        return statistics.median(counts) < ENOUGH_FEATURES
+
+    def _extract(self, span: Span, *, thorough: bool) -> None:
+        step = _step("features", thorough=thorough)
+        if self._checkpoint.has(step):
+            self._ctx.logger.info("%s are in the checkpoint", step)
             return
         self._reconstructor.extract(
             camera_groups(self._source, self._options.camera_model),
-            self._options.max_image_px,
-            self._options.num_features,
-            self._progress.watch(_FEATURES, len(self._source.files), "features of image"),
+            self._settings(upsample=thorough or self._must_upsample()),
+            self._progress.watch(span, len(self._source.files), "features of image"),
         )
-        self._checkpoint.save("features")
+        self._checkpoint.save(step)
 
-    def _match(self, matcher: str, pairs: Pairs, span: Span) -> None:
-        if self._checkpoint.has(matcher):
-            self._ctx.logger.info("%s matches are in the checkpoint", matcher)
+    def _pairs(self, matcher: str) -> Pairs:
+        num, options = len(self._source.files), self._options
+        if matcher == "retrieval":
+            vectors = image_vectors(
+                self._reconstructor.features(FEATURES_PER_IMAGE), self._ctx.seed
+            )
+            return retrieval_pairs(vectors, options.retrieval_neighbours)
+        return planned_pairs(num, matcher, options.sequential_overlap)
+
+    def _match(self, matcher: str, span: Span, *, thorough: bool) -> None:
+        step = _step(matcher, thorough=thorough)
+        if self._checkpoint.has(step):
+            self._ctx.logger.info("%s matches are in the checkpoint", step)
             return
-        self._reconstructor.match(pairs, self._progress.watch(span, len(pairs), "matching pair"))
-        self._checkpoint.save(matcher)
+        pairs = self._pairs(matcher)
+        watch = self._progress.watch(span, len(pairs), "matching pair")
+        self._reconstructor.match(pairs, watch, thorough=thorough)
+        self._checkpoint.save(step)
 
-    def _map(self, matcher: str, span: Span, *, relaxed: bool) -> None:
+    def _map(self, matcher: str, span: Span, settings: MapperSettings) -> None:
         began = time.monotonic()
-        settings = MapperSettings(
-            refine_principal_point=self._options.refine_principal_point, relaxed=relaxed
-        )
         num = len(self._source.files)
         models = self._reconstructor.map(settings, self._progress.watch(span, num, "placing image"))
-        attempt = Attempt(matcher, relaxed, tuple(models), time.monotonic() - began)
+        attempt = Attempt(
+            matcher,
+            settings.thorough,
+            settings.relaxed,
+            tuple(models),
+            time.monotonic() - began,
+        )
         self._attempts.append(attempt)
         self._ctx.logger.info(
-            "%s matching%s: %d of %d images registered, models of %s",
+            "%s matching%s%s: %d of %d images registered, models of %s",
             matcher,
-            ", relaxed" if relaxed else "",
+            ", thorough" if settings.thorough else "",
+            ", relaxed" if settings.relaxed else "",
             attempt.num_registered,
             num,
             [len(model.indices) for model in models],
         )
+
+
+def _step(name: str, *, thorough: bool) -> str:
+    """What a step is called in the checkpoint."""
+    return f"thorough {name}" if thorough else name
+
+
+def _num_processors() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

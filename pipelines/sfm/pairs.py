@@ -6,8 +6,8 @@ import math
 
 Pairs = list[tuple[int, int]]
 
-MAX_EXHAUSTIVE_PHOTOS = 200
-"""Photos beyond this are matched by file name first."""
+MAX_EXHAUSTIVE_PHOTOS = 40
+"""Photos beyond this are matched with those most like them: at 50 that is half of all pairs."""
 SHORT_SEQUENCE = 30
 """Up to here, all pairs cost no more than a sequence's."""
 
@@ -30,14 +30,21 @@ def exhaustive_pairs(num: int) -> Pairs:
     return [(i, j) for i in range(num) for j in range(i + 1, num)]
 
 
-def plan_pairs(num: int, matcher: str, overlap: int, *, is_video: bool) -> tuple[str, Pairs]:
-    """The first attempt's pairs, and what they are called: sequential or exhaustive.
+def choose_matcher(num: int, matcher: str, *, is_video: bool) -> str:
+    """How pairs are chosen at first: sequential, exhaustive or retrieval.
 
-    matcher: auto, sequential or exhaustive. auto: all pairs for photos and short sequences.
+    matcher: what was asked for. auto: all pairs for few images, neighbours in time for more frames
+    of a video, neighbours in looks for more photos.
     """
-    if matcher == "auto":
-        limit = SHORT_SEQUENCE if is_video else MAX_EXHAUSTIVE_PHOTOS
-        matcher = "exhaustive" if num <= limit else "sequential"
+    if matcher != "auto":
+        return matcher
+    if num <= (SHORT_SEQUENCE if is_video else MAX_EXHAUSTIVE_PHOTOS):
+        return "exhaustive"
+    return "sequential" if is_video else "retrieval"
+
+
+def planned_pairs(num: int, matcher: str, overlap: int) -> Pairs:
+    """The pairs of `exhaustive` or `sequential` matching."""
     if matcher == "exhaustive":
-        return matcher, exhaustive_pairs(num)
-    return matcher, sorted({*sequential_pairs(num, overlap), *spaced_pairs(num)})
+        return exhaustive_pairs(num)
+    return sorted({*sequential_pairs(num, overlap), *spaced_pairs(num)})

@@ -28,9 +28,14 @@ _MOVE_HINT = (
 
 @dataclass(frozen=True)
 class Attempt:
-    """One run of the mapper. matcher: which pairs; models: all it found, in COLMAP's order."""
+    """One run of the mapper.
+
+    matcher: which pairs. thorough: COLMAP's own number of trials and adjustments. relaxed: lower
+    thresholds. models: all it found, in COLMAP's order.
+    """
 
     matcher: str
+    thorough: bool
     relaxed: bool
     models: tuple[SparseModel, ...]
     seconds: float
@@ -56,7 +61,7 @@ class Outcome:
     @property
     def chosen(self) -> Attempt:
         """The attempt that placed most images, the earliest among equals; empty without any."""
-        nothing = Attempt(matcher="", relaxed=False, models=(), seconds=0.0)
+        nothing = Attempt("", thorough=False, relaxed=False, models=(), seconds=0.0)
         return max(self.attempts, key=lambda attempt: attempt.num_registered, default=nothing)
 
 
@@ -187,6 +192,7 @@ def build_report(
         "attempts": [
             {
                 "matcher": attempt.matcher,
+                "thorough": attempt.thorough,
                 "relaxed": attempt.relaxed,
                 "num_registered": attempt.num_registered,
                 "model_sizes": [len(found.indices) for found in attempt.models],

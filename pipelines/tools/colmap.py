@@ -16,6 +16,7 @@ Axes here are COLMAP's: cameras look along +Z, +Y down. Pixel centres lie at (0.
 
 from __future__ import annotations
 
+import copy
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -23,12 +24,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pycolmap
 
 from pipelines.errors import ToolError
 from pipelines.tools.colmap_results import (
     PairStatistics,
     SparseModel,
+    read_features,
     read_statistics,
     sparse_model,
 )
@@ -37,10 +41,18 @@ Watch = Callable[[int], None]
 """Called every half second with the number of items done; what it raises ends the call."""
 
 _POLL_S = 0.5
-_IMAGE_PORTION = 16
+_IMAGE_PORTION = 8
 _PAIR_TILE = 12
 """Pairs are taken in tiles of 12 x 12 images, whose features then stay in memory."""
 _PAIR_PORTION = 144
+_SIFT_BYTES_PER_PX = 85
+"""Measured: 75 to 87 per pixel, at 960 to 1,920 px, doubled or not, with one and two threads."""
+_QUICK_GROWTH = 1.4
+"""The model is adjusted as a whole each time it has grown by this factor; COLMAP's default 1.1
+costs twice the time and ends at the same errors, since the last adjustment is of all."""
+_QUICK_TRIALS = 1000
+"""Random samples of matches at most. COLMAP's 10,000 go to pairs that then fail all the same."""
+PER_IMAGE, SINGLE = pycolmap.CameraMode.PER_IMAGE, pycolmap.CameraMode.SINGLE
 
 
 @dataclass(frozen=True)
@@ -52,12 +64,45 @@ class CameraGroup:
 
 
 @dataclass(frozen=True)
+class FeatureSettings:
+    """Which SIFT features are found.
+
+    max_image_px: long side at which they are found; positions are of the full image. num_features:
+    most per image, the coarsest first. upsample: double the image before, which finds two to four
+    times as many and places them a little better, for three times the work. num_threads: images
+    worked on at a time, -1 for one per processor (see `extraction_threads`).
+    """
+
+    max_image_px: int
+    num_features: int
+    upsample: bool = True
+    num_threads: int = -1
+
+
+@dataclass(frozen=True)
 class MapperSettings:
-    """Thresholds of incremental mapping. relaxed: for captures that the defaults fail on."""
+    """How incremental mapping goes about it.
+
+    thorough: bundle adjustment as often as COLMAP does by default, instead of after each growth by
+    40 %. relaxed: lower thresholds, for captures that the defaults fail on.
+    """
 
     refine_focal: bool = True
     refine_principal_point: bool = False
+    thorough: bool = False
     relaxed: bool = False
+
+
+def extraction_threads(settings: FeatureSettings, memory_mb: int, num_processors: int) -> int:
+    """How many images SIFT may work on at a time within `memory_mb` (10^6 bytes), at least one.
+
+    A thread holds the finest octave of the scale space, its differences and gradients:
+    _SIFT_BYTES_PER_PX for each pixel of the image that it starts from, taken as 4:3.
+    """
+    wanted = num_processors if settings.num_threads < 0 else max(settings.num_threads, 1)
+    side = settings.max_image_px * (2 if settings.upsample else 1)
+    each = _SIFT_BYTES_PER_PX * side * side * 3 // 4
+    return max(1, min(wanted, memory_mb * 1_000_000 // each))
 
 
 class Reconstructor:
@@ -89,41 +134,52 @@ class Reconstructor:
             if not link.is_symlink():
                 link.symlink_to(path.resolve())
 
-    def extract(
-        self, groups: Sequence[CameraGroup], max_image_px: int, num_features: int, watch: Watch
-    ) -> None:
-        """Find SIFT features in every image; images of a group share one camera.
+    def on(self, database: Path) -> Reconstructor:
+        """The same images with another database."""
+        other = copy.copy(self)
+        other.database = database
+        return other
 
-        max_image_px: long side at which features are found; positions are of the full image.
-        """
-        options = pycolmap.FeatureExtractionOptions()
-        options.max_image_size = max_image_px
-        options.num_threads = self.num_threads
-        options.sift.max_num_features = num_features
+    def count_features(self, indices: Sequence[int], settings: FeatureSettings) -> list[int]:
+        """How many features a few images would get; the database is left as it is."""
+        probe = self.scratch / "probe.db"
+        probe.unlink(missing_ok=True)
+        names = [self.names[index] for index in indices]
+        reader, options = pycolmap.ImageReaderOptions(), _extraction_options(settings)
+        self.on(probe)._extract_portion(names, reader, options, PER_IMAGE, lambda _done: None, 0)
+        counts = read_statistics(probe, len(self.names)).num_features
+        return [int(counts[index]) for index in indices]
+
+    def extract(
+        self, groups: Sequence[CameraGroup], settings: FeatureSettings, watch: Watch
+    ) -> None:
+        """Find SIFT features in every image; images of a group share one camera."""
+        options = _extraction_options(settings)
+        step = max(_IMAGE_PORTION, 4 * settings.num_threads)
         done = 0
         for group in groups:
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = group.lens
-            for first in range(0, len(group.indices), _IMAGE_PORTION):
-                portion = group.indices[first : first + _IMAGE_PORTION]
+            for first in range(0, len(group.indices), step):
+                portion = group.indices[first : first + step]
                 names = [self.names[index] for index in portion]
-                self._extract_portion(names, reader, options, watch, done)
+                self._extract_portion(names, reader, options, SINGLE, watch, done)
                 done += len(portion)
                 if first == 0 and done < len(self.names):
                     reader.existing_camera_id = self._camera_of(names[0])
         watch(done)
 
     def _extract_portion(
-        self, names: list[str], reader: Any, options: Any, watch: Watch, done: int
+        self, names: list[str], reader: Any, options: Any, cameras: Any, watch: Watch, done: int
     ) -> None:
-        """Features of a few images that share the reader's camera."""
+        """Features of a few images. cameras: whether they share the reader's camera."""
         self._run(
             "finding features",
             lambda token: pycolmap.extract_features(
                 self.database,
                 self.links,
                 image_names=names,
-                camera_mode=pycolmap.CameraMode.SINGLE,
+                camera_mode=cameras,
                 reader_options=reader,
                 extraction_options=options,
                 cancellation_token=token,
@@ -131,19 +187,26 @@ class Reconstructor:
             lambda: watch(done),
         )
 
-    def match(self, pairs: Iterable[tuple[int, int]], watch: Watch) -> None:
+    def match(
+        self, pairs: Iterable[tuple[int, int]], watch: Watch, *, thorough: bool = False
+    ) -> None:
         """Match and verify pairs of indices; those already in the database are not done again.
 
+        thorough: as many random trials as COLMAP's default, for pairs with few true matches.
         watch: receives the number of these pairs that are done.
         """
+        verification = _verification_options(self.seed, thorough=thorough)
         ordered = sorted(
             pairs, key=lambda pair: (pair[0] // _PAIR_TILE, pair[1] // _PAIR_TILE, pair)
         )
         for first in range(0, len(ordered), _PAIR_PORTION):
-            self._match_portion(ordered[first : first + _PAIR_PORTION], watch, first)
+            portion = ordered[first : first + _PAIR_PORTION]
+            self._match_portion(portion, verification, watch, first)
         watch(len(ordered))
 
-    def _match_portion(self, pairs: list[tuple[int, int]], watch: Watch, done: int) -> None:
+    def _match_portion(
+        self, pairs: list[tuple[int, int]], verification: Any, watch: Watch, done: int
+    ) -> None:
         """Match and verify a few pairs."""
         listed = self.scratch / "pairs.txt"
         listed.write_text("".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs), "utf-8")
@@ -151,8 +214,6 @@ class Reconstructor:
         matching.num_threads = self.num_threads
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = listed
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed = self.seed
         self._run(
             "matching images",
             lambda token: pycolmap.match_image_pairs(
@@ -197,6 +258,10 @@ class Reconstructor:
         """What extraction and matching put into the database. Not while another call runs."""
         return read_statistics(self.database, len(self.names))
 
+    def features(self, per_image: int) -> list[npt.NDArray[np.uint8]]:
+        """Descriptors of every image, [at most per_image, 128]. Not while another call runs."""
+        return read_features(self.database, len(self.names), per_image)
+
     def _mapping_options(self, settings: MapperSettings) -> Any:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = self.num_threads
@@ -205,6 +270,10 @@ class Reconstructor:
         options.max_num_models = 10
         options.ba_refine_focal_length = settings.refine_focal
         options.ba_refine_principal_point = settings.refine_principal_point
+        if not settings.thorough:
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = _QUICK_GROWTH
+            options.ba_global_max_refinements = 2
+            options.ba_local_max_refinements = 1
         if settings.relaxed:
             options.min_num_matches = 10
             options.mapper.init_min_tri_angle = 4.0
@@ -242,3 +311,22 @@ class Reconstructor:
                 f"COLMAP failed while {what} of {len(self.names)} images.",
                 details={"log": str(error).splitlines()[-20:]},
             ) from error
+
+
+def _extraction_options(settings: FeatureSettings) -> Any:
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = settings.max_image_px
+    options.num_threads = settings.num_threads
+    options.sift.max_num_features = settings.num_features
+    options.sift.first_octave = -1 if settings.upsample else 0
+    return options
+
+
+def _verification_options(seed: int, *, thorough: bool) -> Any:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    if not thorough:
+        options.ransac.min_num_trials = 30
+        options.ransac.max_num_trials = _QUICK_TRIALS
+        options.ransac.dyn_num_trials_multiplier = 1.0
+    return options

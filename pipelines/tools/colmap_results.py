@@ -146,6 +146,23 @@ def read_statistics(database: Path, num_images: int) -> PairStatistics:
     )
 
 
+def read_features(database: Path, num_images: int, per_image: int) -> list[npt.NDArray[np.uint8]]:
+    """Descriptors of every image, [at most per_image, 128] each, evenly out of all it has.
+
+    They are read image by image. Call it only while pycolmap has the database closed.
+    """
+    found = [np.zeros((0, 128), np.uint8) for _ in range(num_images)]
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        for name, rows, columns, blob in connection.execute(
+            "SELECT name, rows, cols, data FROM descriptors "
+            "JOIN images ON images.image_id = descriptors.image_id WHERE rows > 0"
+        ):
+            whole = np.frombuffer(blob, np.uint8).reshape(rows, columns)
+            chosen = np.linspace(0, rows - 1, min(rows, per_image)).round().astype(np.int64)
+            found[image_index(name)] = whole[chosen]
+    return found
+
+
 def _centred(width: int, height: int) -> npt.NDArray[np.float64]:
     """Pixels to units of the long side from the image's centre, [3, 3]."""
     side = float(max(width, height))

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from pipelines.sfm.pairs import exhaustive_pairs, plan_pairs, sequential_pairs, spaced_pairs
+from pipelines.sfm.pairs import (
+    choose_matcher,
+    exhaustive_pairs,
+    planned_pairs,
+    sequential_pairs,
+    spaced_pairs,
+)
 
 
 def test_a_sequence_matches_neighbours_and_powers_of_two() -> None:
@@ -24,16 +30,20 @@ def test_tiny_counts_have_all_their_pairs_and_no_more() -> None:
     assert set(sequential_pairs(4, 10)) == set(exhaustive_pairs(4)) == set(spaced_pairs(4))
 
 
-def test_auto_takes_all_pairs_for_photos_and_neighbours_for_film() -> None:
-    assert plan_pairs(50, "auto", 10, is_video=False) == ("exhaustive", exhaustive_pairs(50))
-    name, pairs = plan_pairs(300, "auto", 10, is_video=True)
-    assert name == "sequential"
-    assert len(pairs) < 5000
-    assert {(0, 1), (0, 299)} <= set(pairs)
-    assert plan_pairs(1000, "auto", 10, is_video=False)[0] == "sequential"
-    assert plan_pairs(20, "auto", 10, is_video=True)[0] == "exhaustive"
+def test_auto_takes_neighbours_in_time_for_film_and_in_looks_for_many_photos() -> None:
+    assert choose_matcher(20, "auto", is_video=True) == "exhaustive"
+    assert choose_matcher(300, "auto", is_video=True) == "sequential"
+    assert choose_matcher(20, "auto", is_video=False) == "exhaustive"
+    assert choose_matcher(300, "auto", is_video=False) == "retrieval"
 
 
 def test_a_matcher_asked_for_is_taken() -> None:
-    assert plan_pairs(300, "exhaustive", 10, is_video=True)[0] == "exhaustive"
-    assert plan_pairs(5, "sequential", 1, is_video=False)[0] == "sequential"
+    assert choose_matcher(300, "exhaustive", is_video=True) == "exhaustive"
+    assert choose_matcher(5, "retrieval", is_video=False) == "retrieval"
+
+
+def test_planned_pairs_of_a_film_are_few_and_close_loops() -> None:
+    assert planned_pairs(50, "exhaustive", 10) == exhaustive_pairs(50)
+    pairs = planned_pairs(300, "sequential", 10)
+    assert len(pairs) < 5000
+    assert {(0, 1), (0, 299)} <= set(pairs)

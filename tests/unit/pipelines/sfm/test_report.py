@@ -48,7 +48,7 @@ def outcome(models: list[SparseModel], num: int = 20, **changed: dict[int, int])
     for index, value in changed.get("inliers", {}).items():
         inliers[index] = value
     statistics = PairStatistics(features, inliers, 100, 90, np.zeros((0, 3, 3)))
-    return Outcome((Attempt("sequential", False, tuple(models), 1.0),), statistics)
+    return Outcome((Attempt("sequential", False, False, tuple(models), 1.0),), statistics)
 
 
 def test_the_largest_model_is_chosen_wherever_it_stands() -> None:
@@ -59,7 +59,7 @@ def test_the_largest_model_is_chosen_wherever_it_stands() -> None:
 
 def test_the_best_attempt_is_chosen_and_the_first_among_equals() -> None:
     attempts = tuple(
-        Attempt(name, False, (model(tuple(range(size))),), 1.0)
+        Attempt(name, False, False, (model(tuple(range(size))),), 1.0)
         for name, size in (("a", 3), ("b", 9), ("c", 9))
     )
     assert Outcome(attempts, outcome([]).statistics).chosen.matcher == "b"

@@ -17,6 +17,7 @@ from pipelines.ply import read_ply
 from pipelines.sample.align import similarity
 from pipelines.stage import StageContext
 from pipelines.stages.poses import run
+from pipelines.tools.colmap_results import read_statistics
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.sfm.synthetic_room import (
     FOCAL,
@@ -131,6 +132,55 @@ def test_a_second_attempt_takes_features_and_matches_from_the_checkpoint(
     ctx = context(job[0], on_progress=lambda _fraction, message, _eta: messages.append(message))
     assert run(OPTIONS, ctx)["num_registered"] == 11
     assert not [text for text in messages if "features" in text or "matching" in text]
+
+
+def test_where_too_few_register_colmaps_own_way_is_tried_and_kept_for_a_second_attempt(
+    tmp_path: Path,
+) -> None:
+    pictures = [render(pose) for pose in arc_poses(8)]
+    pictures[3] = Image.new("RGB", pictures[3].size, (90, 90, 90))
+    save_video_frames(tmp_path, pictures)
+    options = OPTIONS.model_copy(
+        update={"retry_below_ratio": 1.0, "upsample": "off", "num_features": 800}
+        | {"min_registered": 5}
+    )
+    assert run(options, context(tmp_path))["num_registered"] == 7
+    report = json.loads((tmp_path / ".partial/poses/report.json").read_text("utf-8"))
+    assert [(a["thorough"], a["relaxed"]) for a in report["attempts"]] == [
+        (False, False),
+        (True, False),
+        (True, True),
+    ]
+    checkpoint = tmp_path / ".checkpoint/poses"
+    features = [
+        read_statistics(checkpoint / name, 8).num_features.mean()
+        for name in ("colmap.db", "thorough.db")
+    ]
+    assert features[1] > features[0], "the thorough way doubles the images"
+    messages: list[str] = []
+    ctx = context(tmp_path, on_progress=lambda _fraction, message, _eta: messages.append(message))
+    run(options, ctx)
+    assert not [text for text in messages if "features" in text or "matching" in text]
+
+
+def test_photos_in_no_order_are_matched_by_their_looks(tmp_path: Path) -> None:
+    order = np.random.default_rng(0).permutation(16)
+    folder = tmp_path / "ingest" / "images"
+    folder.mkdir(parents=True)
+    for index, pose in enumerate(arc_poses(16)[order]):
+        render(pose).save(folder / f"{index:02d}.jpg", quality=95)
+    images = [{"file": f"images/{i:02d}.jpg"} for i in range(16)]
+    (tmp_path / "ingest" / "capture.json").write_text(json.dumps({"images": images}), "utf-8")
+    options = OPTIONS.model_copy(update={"matcher": "retrieval", "retrieval_neighbours": 4})
+    assert run(options, context(tmp_path))["num_registered"] == 16
+    report = json.loads((tmp_path / ".partial/poses/report.json").read_text("utf-8"))
+    assert report["matching"]["num_pairs"] < 90
+    cameras = CamerasFile.load(tmp_path / ".partial/poses/cameras.json")
+    poses = np.array([image.world_from_camera for image in cameras.images])
+    truth = arc_poses(16)[order]
+    move = similarity(poses[:, :, 3], truth[:, :, 3])
+    errors = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - truth[:, :, 3], axis=1)
+    assert errors.mean() < 0.01 * np.ptp(truth[:, :, 3], axis=0).max()
 
 
 def test_flat_pictures_have_no_features(tmp_path: Path) -> None:

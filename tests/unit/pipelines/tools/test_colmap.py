@@ -1,0 +1,75 @@
+"""What COLMAP is asked for: threads within memory, and features counted without a trace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.tools.colmap import (
+    CameraGroup,
+    FeatureSettings,
+    Reconstructor,
+    extraction_threads,
+)
+from pipelines.tools.colmap_results import read_statistics
+from tests.unit.pipelines.sfm.synthetic_room import arc_poses, render
+
+COARSE = FeatureSettings(400, 1500, upsample=False, num_threads=1)
+FINE = FeatureSettings(400, 1500, upsample=True, num_threads=1)
+
+
+def three_pictures(folder: Path) -> list[Path]:
+    paths = [folder / f"{i}.jpg" for i in range(3)]
+    for path, pose in zip(paths, arc_poses(3), strict=True):
+        render(pose).save(path, quality=95)
+    return paths
+
+
+def nothing(_done: int) -> None:
+    return
+
+
+def test_threads_shrink_until_their_images_fit_into_memory() -> None:
+    wide = FeatureSettings(1600, 8192, upsample=True)
+    # 3,200 x 2,400 pixels at 85 bytes are 653 MB a thread.
+    assert extraction_threads(wide, 4000, 16) == 6
+    assert extraction_threads(wide, 100, 16) == 1
+    assert extraction_threads(wide, 100_000, 16) == 16
+
+
+def test_without_doubling_four_times_as_many_threads_fit() -> None:
+    assert extraction_threads(FeatureSettings(1600, 8192, upsample=False), 4000, 99) == 24
+
+
+def test_no_more_threads_than_were_asked_for() -> None:
+    small = FeatureSettings(320, 500, upsample=False, num_threads=3)
+    assert extraction_threads(small, 4000, 16) == 3
+
+
+def test_counting_features_leaves_the_database_alone(tmp_path: Path) -> None:
+    reconstructor = Reconstructor(tmp_path / "colmap.db", three_pictures(tmp_path), tmp_path / "s")
+    counted = reconstructor.count_features([0, 2], COARSE)
+    assert not (tmp_path / "colmap.db").exists()
+    reconstructor.extract((CameraGroup((0, 1, 2), "SIMPLE_RADIAL"),), COARSE, nothing)
+    found = read_statistics(tmp_path / "colmap.db", 3).num_features
+    assert counted == [found[0], found[2]]
+    assert min(counted) > 50
+
+
+def test_doubling_finds_more_features(tmp_path: Path) -> None:
+    reconstructor = Reconstructor(tmp_path / "colmap.db", three_pictures(tmp_path), tmp_path / "s")
+    coarse = reconstructor.count_features([0, 1, 2], COARSE)
+    fine = reconstructor.count_features([0, 1, 2], FINE)
+    assert (np.array(fine) > np.array(coarse)).all()
+
+
+def test_features_are_read_evenly_and_no_more_than_wanted(tmp_path: Path) -> None:
+    reconstructor = Reconstructor(tmp_path / "colmap.db", three_pictures(tmp_path), tmp_path / "s")
+    reconstructor.extract((CameraGroup((0, 1, 2), "SIMPLE_RADIAL"),), COARSE, nothing)
+    whole, some = reconstructor.features(100_000), reconstructor.features(20)
+    counts = reconstructor.statistics().num_features
+    assert [len(part) for part in whole] == counts.tolist()
+    assert [part.shape for part in some] == [(20, 128)] * 3
+    np.testing.assert_array_equal(some[1][0], whole[1][0])
+    np.testing.assert_array_equal(some[1][-1], whole[1][-1])
