@@ -64,7 +64,7 @@ class CameraOptimizer(nn.Module):
         """The rays with each camera's correction; `camera_indices` are training indices."""
         if self.mode == "off":
             return rays
-        tangent = self.tangent[rays.camera_indices]
+        tangent = self.tangent.index_select(0, rays.camera_indices)
         # Products of half precision would turn every ray by a thousandth.
         with torch.autocast(tangent.device.type, enabled=False):
             if self.mode == "se3":

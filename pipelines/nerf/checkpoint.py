@@ -21,6 +21,7 @@ from safetensors.torch import load, save
 
 from pipelines.nerf.cameras import SceneTransform
 from pipelines.nerf.config import config_from_dict, find_method
+from pipelines.nerf.encodings import HashGrid
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
 
@@ -92,7 +93,8 @@ def save_model(path: Path, model: Model, scene: SceneTransform, extras: dict[str
     """Write everything that is needed to render again without the capture.
 
     extras: JSON-able; given back by `load_model` as it is. The entries are stored, not deflated:
-    float weights do not shrink.
+    float weights do not shrink. With `train.model.half_tables` the tables of hash grids are written
+    as float16, rounded to 11 bits; `load_model` gives float32 in any case.
     """
     description = {
         "version": MODEL_VERSION,
@@ -104,6 +106,8 @@ def save_model(path: Path, model: Model, scene: SceneTransform, extras: dict[str
     }
     text = json.dumps(description, indent=1, allow_nan=False)
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in _named(model).items()}
+    if model.config.half_tables:
+        weights |= {name: _halved(weights[name]) for name in _table_names(model)}
 
     def write(file: BinaryIO) -> None:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -142,6 +146,18 @@ def load_model(path: Path) -> LoadedModel:
 
 def _named(model: Model) -> dict[str, torch.Tensor]:
     return dict(model.state_dict())
+
+
+def _table_names(model: Model) -> list[str]:
+    """The names of the hash grids' tables among the weights."""
+    grids = (name for name, part in model.named_modules() if isinstance(part, HashGrid))
+    return [f"{name}.table" for name in grids]
+
+
+def _halved(table: torch.Tensor) -> torch.Tensor:
+    """A table as float16, or as it is where a value would not fit."""
+    fits = bool((table.abs() <= torch.finfo(torch.float16).max).all())
+    return table.half() if fits else table
 
 
 def _bad_model(path: Path, problem: str) -> NerfError:

@@ -180,6 +180,17 @@ class DataConfig:
     eval_stretch_place: float = option(
         0.5, "Where the stretch lies: 0 at the path's start, 1 at its end.", ge=0.0, le=1.0
     )
+    coarse_steps: int = option(
+        0,
+        "Until this step rays show the mean of a square of pixels, which shrinks by and by; 0 for "
+        "single pixels from the start.",
+        unit="steps",
+        ge=0,
+        le=10**7,
+    )
+    coarse_halvings: int = option(
+        2, "How often the images are halved at first: squares of 2^n pixels.", ge=1, le=5
+    )
     max_memory_gib: float = option(
         32.0,
         "Most memory that the images may take, 3 bytes a pixel, 4 with masks; more is refused.",
@@ -204,6 +215,9 @@ class OptimizerConfig:
     camera_lr_final: float = option(1e-4, "Rate of the cameras at the end.", ge=1e-9, le=1.0)
     camera_decay_steps: int = option(5000, "Length of their decay.", unit="steps", ge=1, le=10**8)
     eps: float = option(1e-15, "Adam's epsilon.", ge=0.0, le=1.0)
+    beta2: float = option(
+        0.999, "What is left of Adam's mean squared gradient at a step.", ge=0.0, le=0.999999
+    )
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,14 @@ class InstantNgpConfig(ModelConfig):
         2**18, "Most samples of a training step; rays beyond them wait.", ge=256, le=2**28
     )
 
+    samples_per_step: int = option(
+        0,
+        "As many rays a step as bring about so many samples that light reaches; 0 for "
+        "rays_per_step at any number of samples.",
+        ge=0,
+        le=2**28,
+    )
+
     def check(self, path: str) -> None:
         """As `ModelConfig.check`."""
         super().check(path)

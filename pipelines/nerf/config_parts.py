@@ -54,6 +54,12 @@ class HashGridConfig:
     max_res: int = option(2048, "Cells per side of the finest level.", ge=2, le=65536)
     log2_table_size: int = option(19, "log2 of the entries per level.", ge=8, le=24)
     features_per_level: int = option(2, "Features per entry.", ge=1, le=8)
+    start_levels: int = option(
+        0, "Levels learned from the first step on, the coarsest ones; 0 for all.", ge=0, le=32
+    )
+    steps_per_level: int = option(
+        50, "Then one level more after every so many steps.", unit="steps", ge=1, le=10**6
+    )
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,9 @@ class ModelConfig:
     camera_mode: str = option("so3xr3", "Camera optimisation.", choices=("off", "so3xr3", "se3"))
     camera_translation_penalty: float = option(1e-2, "Weight on moved cameras.", ge=0.0, le=1e3)
     camera_rotation_penalty: float = option(1e-3, "Weight on turned cameras.", ge=0.0, le=1e3)
+    half_tables: bool = option(
+        False, "Keep the tables of hash grids in half precision in `model.zip`: half its size."
+    )
 
     def check(self, path: str) -> None:
         """Check options against each other; bounds and names are checked already.

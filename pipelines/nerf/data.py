@@ -70,6 +70,16 @@ def _num_held_out(num_images: int, fraction: float) -> int:
     return max(num_images - num_train, min(MIN_HELD_OUT, num_images // 4))
 
 
+def block_side(step: int, config: DataConfig) -> int:
+    """Side, in pixels, of the squares whose means a step learns from; 1 from `coarse_steps` on.
+
+    2^k with k = halvings - floor(step halvings / coarse_steps): each size for an equal share.
+    """
+    if step >= config.coarse_steps:
+        return 1
+    return int(2 ** (config.coarse_halvings - step * config.coarse_halvings // config.coarse_steps))
+
+
 def memory_bytes(sizes: Sequence[tuple[int, int]], *, masked: bool) -> int:
     """What `ImageData` takes for pictures of these (width, height): 3 bytes a pixel, 4 masked."""
     return (4 if masked else 3) * sum(width * height for width, height in sizes)
@@ -254,6 +264,9 @@ class PixelSampler:
     indices: the images drawn from; batches speak of positions in this list, not of image numbers.
     device: where pixels are held and drawn. Elsewhere than on the CPU this takes the images' bytes
         there once, and the generator given to `draw` must be of that device.
+    block: side of the square of pixels that a ray stands for, 1 unless set. Images are cut into
+        such squares from their first pixel on; a ray shows the mean of the usable pixels of its
+        square and passes through the mean of their centres. What is drawn is the same at any side.
     Raises NerfError `too_few_images` where masks leave nothing.
     """
 
@@ -261,6 +274,7 @@ class PixelSampler:
         self, images: ImageData, indices: Sequence[int], device: torch.device | str = "cpu"
     ) -> None:
         self.device = torch.device(device)
+        self.block = 1
         rows = torch.tensor(list(indices), dtype=torch.int64)
         starts = images.offsets[rows]
         counts = images.offsets[rows + 1] - starts
@@ -273,7 +287,7 @@ class PixelSampler:
         self._usable = None if usable is None else usable.to(self.device)
         self._pixels = images.pixels.to(self.device)
         self._starts = starts.to(self.device)
-        self._widths = images.sizes[rows, 0].to(self.device)
+        self._widths, self._heights = images.sizes[rows].to(self.device).unbind(-1)
         self._ends = counts.cumsum(0).to(self.device)
         self._firsts = self._ends - counts.to(self.device)
 
@@ -288,8 +302,31 @@ class PixelSampler:
             within = row - self._starts[position]
         width = self._widths[position]
         x, y = within % width, torch.div(within, width, rounding_mode="floor")
+        if self.block > 1:
+            return position, *self._block_means(position, x, y)
         colors = self._pixels[self._starts[position] + within].float() / 255.0
         return position, torch.stack([x, y], dim=-1).float() + 0.5, colors
+
+    def _block_means(self, position: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean centre [B, 2] and colour [B, 3] of the usable pixels in the squares around pixels.
+
+        position, x, y: [B] int64, of usable pixels, so that no square is empty. The same as pixels
+        of reduced pictures, which would take memory.
+        """
+        offset = torch.arange(self.block, device=self.device)
+        columns = (x - x % self.block)[:, None] + offset
+        lines = (y - y % self.block)[:, None] + offset
+        width, height = self._widths[position, None], self._heights[position, None]
+        usable = (lines < height)[:, :, None] & (columns < width)[:, None, :]
+        rows = self._starts[position, None, None] + lines[:, :, None] * width[:, :, None]
+        rows = torch.where(usable, rows + columns[:, None, :], self._starts[position, None, None])
+        if self._usable is not None:
+            usable = usable & self._usable.valid[rows]
+        share = usable / usable.sum(dim=(1, 2), keepdim=True)
+        colors = (self._pixels[rows] / 255.0 * share[..., None]).sum(dim=(1, 2))
+        center_x = (columns * share.sum(dim=1)).sum(dim=1)
+        center_y = (lines * share.sum(dim=2)).sum(dim=1)
+        return torch.stack([center_x, center_y], dim=-1) + 0.5, colors
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,10 @@ def _entry_index(
 class HashGrid(nn.Module):
     """A trainable multi-resolution hash grid.
 
-    table: [E, F] parameter, uniform in [-1e-3, 1e-3] at the start.
+    table: [E, F] parameter, uniform in [-1e-3, 1e-3] at the start; 0 in levels that are learned
+    later (`start_levels`), so that whoever reads all levels gets the same features.
+    active_levels: the coarsest levels, those that are read and learned; all of them where nobody
+    trains.
     engine: "plain" for the PyTorch definition; "fast" uses the compiled twin where there is one
     for the table (float32, on the CPU or a CUDA GPU) and the plain definition elsewhere. The twin
     has no second derivatives: a loss on normals of the density in training needs "plain", and a
@@ -121,8 +124,11 @@ class HashGrid(nn.Module):
         layout = level_layout(config)
         self.config = config
         self.engine = "plain"
+        self.active_levels = config.num_levels
         table = torch.empty(layout.offsets[-1], config.features_per_level)
-        self.table = nn.Parameter(table.uniform_(-INIT_RANGE, INIT_RANGE))
+        table.uniform_(-INIT_RANGE, INIT_RANGE)
+        table[layout.offsets[self.levels_at(0)] :] = 0.0
+        self.table = nn.Parameter(table)
         self.register_buffer("offsets", torch.tensor(layout.offsets, dtype=torch.int64))
         self.register_buffer("resolutions", torch.tensor(layout.resolutions, dtype=torch.int64))
         self.register_buffer("dense", torch.tensor(layout.dense, dtype=torch.bool))
@@ -132,16 +138,28 @@ class HashGrid(nn.Module):
         """Features per point, L * F."""
         return self.config.num_levels * self.config.features_per_level
 
+    def levels_at(self, step: int) -> int:
+        """How many levels, coarsest first, a training step reads and learns; all in the end.
+
+        Source: the coarse-to-fine schedule of Neuralangelo, arXiv:2306.03092, section 3.3.
+        """
+        config = self.config
+        first = config.start_levels or config.num_levels
+        return min(config.num_levels, first + step // config.steps_per_level)
+
+    def active(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(resolutions, dense, offsets) of the active levels, as `hash_encode` takes them."""
+        count = self.active_levels
+        return self.resolutions[:count], self.dense[:count], self.offsets[: count + 1]
+
     def forward(self, unit_points: Tensor) -> Tensor:
-        """Features [..., L * F] at points [..., 3] in [0, 1]^3."""
-        levels = (self.resolutions, self.dense, self.offsets)
+        """Features [..., L * F] at points [..., 3] in [0, 1]^3; 0 in levels that are not active."""
         encode = self._compiled_twin(unit_points)
-        if encode is None:
-            return hash_encode(unit_points, self.table, *levels)
-        encoded = encode(unit_points, self.table, *levels)
-        if encoded.requires_grad:
+        encoded = (encode or hash_encode)(unit_points, self.table, *self.active())
+        if encode is not None and encoded.requires_grad:
             encoded.register_hook(_refuse_second_derivatives)  # type: ignore[no-untyped-call]
-        return encoded
+        missing = self.num_outputs - encoded.shape[-1]
+        return nn.functional.pad(encoded, (0, missing)) if missing else encoded
 
     def _compiled_twin(self, unit_points: Tensor) -> Callable[..., Tensor] | None:
         """The kernel for where table and points are, if the engine wants one and there is one."""

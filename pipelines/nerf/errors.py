@@ -8,7 +8,7 @@ class NerfError(Exception):
 
     code: stable identifier, snake_case. Codes in use: bad_config, bad_cameras, bad_image,
         bad_rays, bad_plugin, too_few_images, too_much_memory, non_finite_loss, bad_checkpoint,
-        bad_model_file, lpips_weights.
+        bad_model_file, lpips_weights, gpu_failed.
     message: what failed and on what, one sentence without paths of this machine.
     hint: what to do about it, one sentence.
     """

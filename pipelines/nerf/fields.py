@@ -195,7 +195,10 @@ class NerfactoField(nn.Module):
 
     def codes(self, camera_indices: Tensor) -> Tensor | None:
         """The appearance codes [R, A] of training images, or None where there are none."""
-        return None if self.appearance is None else self.appearance(camera_indices)
+        if self.appearance is None:
+            return None
+        # The gradient of an embedding sorts on a GPU; that of `index_select` adds.
+        return self.appearance.weight.index_select(0, camera_indices)
 
     def mean_code(self) -> Tensor | None:
         """The mean code [A] of all training images: how the scene looks by default."""

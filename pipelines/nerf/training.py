@@ -21,7 +21,7 @@ from torch import Tensor
 from pipelines.nerf.cameras import Cameras
 from pipelines.nerf.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.nerf.config import TrainConfig, validate
-from pipelines.nerf.data import ImageData, PixelSampler
+from pipelines.nerf.data import ImageData, PixelSampler, block_side
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.metrics import psnr_from_mse
 from pipelines.nerf.models.base import Model
@@ -92,9 +92,10 @@ def train(
     model = state.model.train()
     graphs = None
     if device.type == "cuda" and is_fast(config, device):
-        graphs = _GpuSteps(state, sampler, posed, config)
+        graphs = GpuSteps(state, sampler, posed)
     preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
     step_times: deque[float] = deque(maxlen=TIMED_STEPS)
+    step_rays: deque[int] = deque(maxlen=TIMED_STEPS)
     last_saved = time.monotonic()
 
     def save() -> None:
@@ -105,19 +106,21 @@ def train(
     while state.step < config.max_steps and not _time_is_up(state.elapsed_s, config):
         started = time.monotonic()
         is_reported = device.type == "cpu" or state.step % STEPS_PER_CUDA_REPORT == 0
+        shape = begin_step(state, config)
         try:
             if graphs is not None:
-                losses = graphs.run(state, config, check=is_reported)
+                losses = graphs.run(state, config, shape, check=is_reported)
             else:
-                losses = _optimise_once(state, sampler, posed, config, check=is_reported)
+                losses = optimise_once(state, sampler, posed, config, shape, check=is_reported)
         except NonFiniteLoss:
             if _is_finite(model):
                 save()
             raise
         step_times.append(time.monotonic() - started)
+        step_rays.append(shape.num_rays)
         state.elapsed_s += step_times[-1]
         if is_reported:
-            on_progress(_progress(state, config, losses, step_times))
+            on_progress(_progress(state, config, losses, step_times, step_rays))
         if time.monotonic() - last_saved >= config.checkpoint_seconds:
             save()
             last_saved = time.monotonic()
@@ -131,11 +134,32 @@ def train(
     return model.eval()
 
 
-def _optimise_once(
+@dataclass(frozen=True)
+class StepShape:
+    """What decides the sizes of a step's tensors.
+
+    num_rays: of the batch. block: side of the squares of pixels that rays stand for.
+    levels: active levels of each hash grid.
+    """
+
+    num_rays: int
+    block: int
+    levels: tuple[int, ...]
+
+
+def begin_step(state: TrainingState, config: TrainConfig) -> StepShape:
+    """Bring the model to the step that is due."""
+    levels = state.model.begin_step(state.step)
+    num_rays = state.model.rays_of_step(config.rays_per_step)
+    return StepShape(num_rays, block_side(state.step, config.data), levels)
+
+
+def optimise_once(
     state: TrainingState,
     sampler: PixelSampler,
     cameras: Cameras,
     config: TrainConfig,
+    shape: StepShape,
     *,
     check: bool,
 ) -> dict[str, float]:
@@ -151,7 +175,8 @@ def _optimise_once(
             group["lr"] = rates[name]
     plan = model.plan_step(state.step, state.model_random)
 
-    drawn = sampler.draw(config.rays_per_step, state.pixel_random)
+    sampler.block = shape.block
+    drawn = sampler.draw(shape.num_rays, state.pixel_random)
     index, pixels, colors = (item.to(device) for item in drawn)
     rays = cameras.generate_rays(index, pixels)
     with torch.autocast(device.type, dtype=torch.float16, enabled=device.type == "cuda"):
@@ -172,28 +197,39 @@ def _optimise_once(
     return values
 
 
-class _GpuSteps:
+class GpuSteps:
     """Steps of the GPU engine (`gpu.step`), which the host starts and does not wait for."""
 
-    def __init__(
-        self, state: TrainingState, sampler: PixelSampler, cameras: Cameras, config: TrainConfig
-    ) -> None:
+    def __init__(self, state: TrainingState, sampler: PixelSampler, cameras: Cameras) -> None:
         from pipelines.nerf.gpu.step import LossReader, TrainingStep
 
-        self._step = TrainingStep(
-            state.model,
-            state.optimizers,
-            state.scaler,
-            sampler,
-            cameras,
-            config.rays_per_step,
-            pixel_random=state.pixel_random,
-            model_random=state.model_random,
-        )
+        def start(shape: StepShape) -> TrainingStep:
+            return TrainingStep(
+                state.model,
+                state.optimizers,
+                state.scaler,
+                sampler,
+                cameras,
+                shape.num_rays,
+                pixel_random=state.pixel_random,
+                model_random=state.model_random,
+            )
+
+        self._start, self._sampler = start, sampler
+        self._shape: StepShape | None = None
+        self._step: TrainingStep | None = None
         self._reader = LossReader(cameras.focal.device)
 
-    def run(self, state: TrainingState, config: TrainConfig, *, check: bool) -> dict[str, float]:
-        """As `_optimise_once`; the losses are those of the last step that was checked."""
+    def run(
+        self, state: TrainingState, config: TrainConfig, shape: StepShape, *, check: bool
+    ) -> dict[str, float]:
+        """As `optimise_once`; the losses are those of the last step that was checked.
+
+        Steps of another shape than the last one's are captured anew.
+        """
+        self._sampler.block = shape.block
+        if self._step is None or shape != self._shape:
+            self._step, self._shape = self._start(shape), shape
         self._step.run(state.step, learning_rates(config.optimizer, state.step))
         state.step += 1
         if not check:
@@ -248,7 +284,11 @@ def _time_is_up(elapsed_s: float, config: TrainConfig) -> bool:
 
 
 def _progress(
-    state: TrainingState, config: TrainConfig, losses: dict[str, float], step_times: deque[float]
+    state: TrainingState,
+    config: TrainConfig,
+    losses: dict[str, float],
+    step_times: deque[float],
+    step_rays: deque[int],
 ) -> TrainProgress:
     per_step = sum(step_times) / len(step_times)
     eta_s = (config.max_steps - state.step) * per_step
@@ -264,7 +304,7 @@ def _progress(
         psnr=psnr_from_mse(losses["rgb"]),
         elapsed_s=state.elapsed_s,
         eta_s=eta_s,
-        rays_per_s=config.rays_per_step / max(per_step, 1e-9),
+        rays_per_s=sum(step_rays) / max(sum(step_times), 1e-9),
     )
 
 

@@ -91,12 +91,24 @@ class TrainingState:
 
 
 def is_fast(config: TrainConfig, device: torch.device) -> bool:
-    """Whether the compiled engine trains; "auto" takes it on the CPU alone.
+    """Whether the compiled engine trains.
 
-    That of GPUs is right in Triton's interpreter and has not been measured on one: it is asked for
-    by name.
+    That of GPUs is tried out before it is trusted (`gpu.self_check`, seconds, once a process):
+    where it fails, "auto" trains with PyTorch, and "fast" raises NerfError `gpu_failed`.
     """
-    return config.engine == "fast" or (config.engine == "auto" and device.type == "cpu")
+    if config.engine == "plain" or device.type == "cpu":
+        return config.engine != "plain"
+    # Imported here: a machine without a GPU needs no Triton.
+    from pipelines.nerf.gpu.self_check import engine_problem
+
+    problem = engine_problem(config, device)
+    if problem is not None and config.engine == "fast":
+        raise NerfError(
+            "gpu_failed",
+            f"The compiled engine does not work on {device}: {problem}.",
+            "Set train.engine to plain, or auto.",
+        )
+    return problem is None
 
 
 def _plain_adam(parameters: Iterable[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
@@ -136,6 +148,9 @@ def initial_state(
         # A few hundred numbers: no need of a compiled pass, but of one that can be captured.
         few = adam if on_gpu and fast else torch.optim.Adam
         optimizers["cameras"] = few(cameras, lr=rates.camera_lr, eps=rates.eps)
+    for optimizer in optimizers.values():
+        for group in optimizer.param_groups:
+            group["betas"] = (group["betas"][0], rates.beta2)
     return TrainingState(
         model=model,
         optimizers=optimizers,

@@ -106,6 +106,7 @@ def print_report(runs: Sequence[Run], names: Sequence[str], target: float) -> li
             f"seed {run.seed}",
             str(mark.step),
             number(mark.train_s, 1),
+            number(mark.cpu_s, 1),
             number(mark.mean_psnr(names)),
             number(mark.mean_ssim(names), 3),
         ]
@@ -113,7 +114,7 @@ def print_report(runs: Sequence[Run], names: Sequence[str], target: float) -> li
         for mark in run.marks
     ]
     print(f"\nMean over {', '.join(names)}\n")
-    print(markdown_table(["", "steps", "training s", "PSNR", "SSIM"], rows))
+    print(markdown_table(["", "steps", "training s", "CPU s", "PSNR", "SSIM"], rows))
     reached = [time_to_reach(curve(run, names), target) for run in runs]
     shown = ", ".join("never" if value is None else f"{value:.1f} s" for value in reached)
     average = mean(reached)

@@ -24,11 +24,15 @@ POLL_STEPS = 5
 
 @dataclass(frozen=True)
 class Mark:
-    """The state after `step` steps and `train_s` seconds of training; scores by image name."""
+    """The state after `step` steps and `train_s` seconds of training; scores by image name.
+
+    cpu_s: seconds of all cores together that training took, its start included.
+    """
 
     step: int
     train_s: float
     scores: dict[str, Score]
+    cpu_s: float = 0.0
 
     def mean_psnr(self, names: Sequence[str] | None = None) -> float:
         """Mean over these images, or over all."""
@@ -97,10 +101,15 @@ def run_with_marks(
     every = math.gcd(*steps) if steps else 0
     every = math.gcd(every, POLL_STEPS) if seconds else every
     config = replace(config, preview_every_steps=every or config.max_steps)
-    clock, marks, waiting = _Clock(), [], sorted(seconds)
+    clock, marks, waiting = _Clock(), list[Mark](), sorted(seconds)
+    cpu_begin = time.process_time()  # moved on by what measuring takes
 
     def measure(step: int, model: Any, elapsed: float) -> None:
-        marks.append(Mark(step, elapsed, evaluate(model, capture, images, render_engine)))
+        nonlocal cpu_begin
+        cpu = time.process_time()
+        scores = evaluate(model, capture, images, render_engine)
+        marks.append(Mark(step, elapsed, scores, cpu - cpu_begin))
+        cpu_begin += time.process_time() - cpu
         clock.set(step, elapsed)
 
     def look(step: int, model: Any) -> None:

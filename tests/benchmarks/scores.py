@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pipelines.nerf.cameras import Cameras
 from pipelines.nerf.metrics import psnr, ssim
+from pipelines.nerf.render_config import ALL_SAMPLES
 from pipelines.nerf.renderer import Renderer
 from tests.benchmarks.capture_data import BenchmarkCapture
 
@@ -55,7 +56,7 @@ def render_images(
     cameras: in place of the capture's. codes: appearance codes by image number, else the mean.
     engine: of the renderer.
     """
-    renderer = Renderer(model, capture.scene, engine=engine, early_stop=0.0, weight_threshold=0.0)
+    renderer = Renderer(model, capture.scene, engine=engine, config=ALL_SAMPLES)
     posed = capture.cameras if cameras is None else cameras
     pictures = {}
     for index in images:

@@ -177,11 +177,13 @@ class _RenderField(torch.autograd.Function):
         counts = _tile_counts(num_rays, num_samples)
         tiles, features = len(counts), field.grid.num_outputs
         moving = ctx.needs_input_grad[0] or ctx.needs_input_grad[1]
+        # Levels that are not active are not written: their features and slopes are 0.
+        empty = np.empty if len(net.resolutions) * NUM_FEATURES == features else np.zeros
         kept = Kept(
             counts,
             np.zeros((tiles, 3, TILE), np.float32),
-            np.empty((tiles, round_up(features, 4), TILE), np.float32),
-            np.empty((tiles, 3 * features if moving else 0, TILE), np.float32),
+            empty((tiles, round_up(features, 4), TILE), np.float32),
+            empty((tiles, 3 * features if moving else 0, TILE), np.float32),
             np.empty((num_rays, num_samples), np.float32),
             np.empty((num_rays * num_samples, 3), np.float32),
         )
@@ -283,11 +285,12 @@ def _pack(field: NerfactoField, table: FloatArray, arrays: list[FloatArray]) -> 
     arrays: weight and bias of the two density and the three colour layers.
     """
     from_ray, from_outputs = _split_first(field, arrays[4])
+    resolutions, dense, offsets = (level.numpy() for level in field.grid.active())
     return FieldNet(
         table,
-        field.grid.resolutions.numpy(),
-        field.grid.dense.numpy(),
-        field.grid.offsets.numpy(),
+        resolutions,
+        dense,
+        offsets,
         pack_arrays(arrays[0], arrays[1]),
         pack_arrays(arrays[2], arrays[3]),
         pack_arrays(from_ray, arrays[5]),

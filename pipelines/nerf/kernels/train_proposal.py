@@ -119,12 +119,12 @@ def _pack(network: DensityField) -> RoundNet:
     hidden, output = network.mlp.layers
     assert isinstance(hidden, nn.Linear)
     assert isinstance(output, nn.Linear)
-    grid = network.grid
+    resolutions, dense, offsets = (level.numpy() for level in network.grid.active())
     return RoundNet(
-        grid.table.detach().numpy(),
-        grid.resolutions.numpy(),
-        grid.dense.numpy(),
-        grid.offsets.numpy(),
+        network.grid.table.detach().numpy(),
+        resolutions,
+        dense,
+        offsets,
         pack_layer(hidden),
         pack_layer(output),
         pack_transposed(output.weight.detach().numpy()),

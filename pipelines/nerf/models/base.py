@@ -111,6 +111,20 @@ class Model(nn.Module, ABC):
     def density(self, points: Tensor) -> Tensor:
         """Density [...] per scene unit at points [..., 3] in scene space."""
 
+    def begin_step(self, step: int) -> tuple[int, ...]:
+        """Let in the levels of hash grids that are due; called before `plan_step`.
+
+        Returns how many levels of each grid are active.
+        """
+        grids = [module for module in self.modules() if isinstance(module, HashGrid)]
+        for grid in grids:
+            grid.active_levels = grid.levels_at(step)
+        return tuple(grid.active_levels for grid in grids)
+
+    def rays_of_step(self, rays_per_step: int) -> int:
+        """Rays of the next step, of a run whose options ask for `rays_per_step`."""
+        return rays_per_step
+
     def plan_step(self, step: int, generator: torch.Generator | None = None) -> StepPlan:
         """Decide what a training step does; called once before it. May update samplers.
 

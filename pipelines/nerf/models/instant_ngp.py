@@ -7,6 +7,7 @@ Symbols: R rays, P samples of all rays together. Source: Mueller et al., arXiv:2
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,6 +32,10 @@ POINTS_PER_PASS = {"cpu": 2**15, "cuda": 2**20}
 """Points whose density is asked for at once without a graph, by kind of device."""
 SEEN_PER_RAY = 64
 """Samples of a ray that are seen, for the estimate of memory alone."""
+RAYS_TOGETHER = 16
+"""Rays of a step are a multiple of it where their number is adapted."""
+SHARE_OF_A_STEP = 0.2
+"""What a step counts in the running mean of samples per ray: it forgets within some ten steps."""
 
 
 class InstantNgp(Model):
@@ -50,6 +55,8 @@ class InstantNgp(Model):
             decay=config.occupancy_decay,
             threshold=-math.log1p(-config.occupancy_threshold) / self.stride.length,
         )
+        self.samples_per_ray = 0.0
+        self._counted: tuple[int, int] | None = None
         # Without a contraction the hash grid covers [-1, 1]^3, which is to be the last cascade.
         self.shrink = 1.0 / self.occupancy.half_side if config.contraction == "none" else 1.0
 
@@ -63,6 +70,36 @@ class InstantNgp(Model):
                 generator=generator,
             )
         return StepPlan(step)
+
+    def rays_of_step(self, rays_per_step: int) -> int:
+        """As `Model.rays_of_step`; with `samples_per_step` what the last steps call for.
+
+        At least 16, at most 16 times what the options say, in sixteens.
+        Source: the adaptive batch of arXiv:2201.05989, appendix E.2.
+        """
+        wanted = self.config.samples_per_step
+        if wanted == 0 or self.samples_per_ray == 0.0:
+            return rays_per_step
+        rays = min(wanted / self.samples_per_ray, RAYS_TOGETHER * rays_per_step)
+        return max(1, round(rays / RAYS_TOGETHER)) * RAYS_TOGETHER
+
+    def finish_step(self, plan: StepPlan) -> None:
+        """Learn from the step how many samples a ray has: a running mean."""
+        del plan
+        if self._counted is not None:
+            samples, rays = self._counted
+            found = max(samples, 1) / rays
+            old = self.samples_per_ray or found
+            self.samples_per_ray = old + SHARE_OF_A_STEP * (found - old)
+            self._counted = None
+
+    def schedule_state(self) -> dict[str, Any]:
+        """As `Model.schedule_state`."""
+        return {"samples_per_ray": self.samples_per_ray}
+
+    def load_schedule_state(self, state: dict[str, Any]) -> None:
+        """As `Model.load_schedule_state`."""
+        self.samples_per_ray = float(state["samples_per_ray"])
 
     def forward(
         self,
@@ -87,6 +124,8 @@ class InstantNgp(Model):
         if self.training:
             samples, kept = first_rays(samples, config.max_samples)
         samples = self._seen(rays.detach(), samples)
+        if kept is not None and config.samples_per_step > 0:
+            self._counted = len(samples), int(kept.sum())
         if self.training and len(samples) == 0:
             samples = _sample_of_no_length(samples, config.near)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import torch
 
 from pipelines.nerf.cameras import SceneTransform
 from pipelines.nerf.checkpoint import load_checkpoint, load_model, save_checkpoint, save_model
+from pipelines.nerf.config import NerfactoConfig
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.nerfacto import Nerfacto
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras
@@ -95,3 +97,28 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(NerfError, match="cannot be read"):
         load_checkpoint(path)
+
+
+def test_half_precision_tables_are_half_the_size_and_rounded_once(tmp_path: Path) -> None:
+    config = tiny_config().model
+    assert isinstance(config, NerfactoConfig)
+    model = Nerfacto(replace(config, half_tables=True), 5).eval()
+    tables = [name for name in model.state_dict() if name.endswith("grid.table")]
+    field, first, second = tables
+    with torch.no_grad():
+        model.state_dict()[field].normal_()
+        model.state_dict()[first][0, 0] = 1e6  # no float16
+    path, whole = tmp_path / "model.zip", tmp_path / "whole.zip"
+    save_model(path, model, SCENE, {})
+    weights, found = model.state_dict(), load_model(path).model.state_dict()
+    # 11 bits, or 2^-24 apart near 0: the nearest float16 is at most half a unit away.
+    for name in (field, second):
+        assert found[name].dtype == torch.float32
+        bound = (2.0**-11 * weights[name].abs()).clamp_min(2.0**-25)
+        assert bool(((found[name] - weights[name]).abs() <= bound).all())
+        assert not torch.equal(found[name], weights[name])
+    for name in set(weights) - {field, second}:
+        assert torch.equal(found[name], weights[name]), name
+    save_model(whole, Nerfacto(config, 5), SCENE, {})
+    spared = 2 * (weights[field].numel() + weights[second].numel())
+    assert whole.stat().st_size - path.stat().st_size == pytest.approx(spared, abs=100)

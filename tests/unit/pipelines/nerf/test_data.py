@@ -11,11 +11,13 @@ import pytest
 import torch
 from PIL import Image
 
+from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.config import DataConfig
 from pipelines.nerf.data import (
     BLOCK_PIXELS,
     ImageData,
     PixelSampler,
+    block_side,
     image_sizes,
     load_images,
     memory_bytes,
@@ -310,3 +312,72 @@ def test_one_image_and_its_mask_come_back_as_they_were_put() -> None:
         assert found is not None
         assert np.array_equal(found.numpy(), usable)
     assert ImageData.from_arrays(pictures).mask(0) is None
+
+
+def _slow_block_mean(
+    picture: np.ndarray, mask: np.ndarray, x: int, y: int, side: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean centre and colour of the usable pixels of the square that holds pixel (x, y)."""
+    centers, colors = [], []
+    for row in range(y // side * side, y // side * side + side):
+        for column in range(x // side * side, x // side * side + side):
+            if row < picture.shape[0] and column < picture.shape[1] and mask[row, column]:
+                centers.append((column + 0.5, row + 0.5))
+                colors.append(picture[row, column] / 255.0)
+    return np.mean(centers, axis=0), np.mean(colors, axis=0)
+
+
+@pytest.mark.parametrize("side", [2, 4, 8])
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_coarse_ray_shows_the_mean_of_the_usable_pixels_of_its_square(
+    side: int, masked: bool
+) -> None:
+    random = np.random.default_rng(6)
+    shapes = [(13, 11), (16, 9), (3, 30)]  # few are multiples of the side
+    pictures = [random.integers(0, 256, (*shape, 3), np.uint8) for shape in shapes]
+    masks = [random.random(s) < 0.5 if masked else np.ones(s, bool) for s in shapes]
+    images = ImageData.from_arrays(pictures, masks if masked else None)
+    indices = [2, 0, 1]
+    sampler = PixelSampler(images, indices)
+    position, pixels, _ = sampler.draw(200, torch.Generator().manual_seed(4))
+    sampler.block = side
+    same, centers, colors = sampler.draw(200, torch.Generator().manual_seed(4))
+    assert torch.equal(position, same)
+    for k in range(200):
+        image = indices[int(position[k])]
+        x, y = (pixels[k] - 0.5).int().tolist()
+        center, color = _slow_block_mean(pictures[image], masks[image], x, y, side)
+        assert centers[k].tolist() == pytest.approx(center, abs=1e-4)
+        assert colors[k].tolist() == pytest.approx(color, abs=1e-6)
+
+
+def test_coarse_rays_are_those_of_the_reduced_images_and_cameras() -> None:
+    random = np.random.default_rng(3)
+    picture = random.integers(0, 256, (8, 12, 3), np.uint8)
+    cameras = Cameras.from_arrays(
+        world_from_camera=np.eye(4)[None, :3],
+        scene=SceneTransform((0.0, 0.0, 0.0), 1.0),
+        widths=[12],
+        heights=[8],
+        focal=[[10.0, 9.0]],
+        principal=[[5.5, 4.25]],
+    )
+    sampler = PixelSampler(ImageData.from_arrays([picture]), [0])
+    sampler.block = 4
+    index, pixels, colors = sampler.draw(50, torch.Generator().manual_seed(0))
+    rays = cameras.generate_rays(index, pixels)
+    small = cameras.resized(3)
+    assert small.size.tolist() == [[3, 2]]
+    reduced = small.generate_rays(index, pixels / 4)
+    assert torch.allclose(rays.directions, reduced.directions, atol=1e-6)
+    truth = torch.from_numpy(picture).float().reshape(2, 4, 3, 4, 3).mean((1, 3)) / 255
+    x, y = (pixels / 4 - 0.5).unbind(-1)
+    assert torch.equal(x, x.round())
+    assert torch.allclose(colors, truth[y.long(), x.long()], atol=1e-6)
+
+
+def test_squares_shrink_in_equal_shares_of_the_coarse_steps() -> None:
+    config = DataConfig(coarse_steps=90, coarse_halvings=3)
+    sides = [block_side(step, config) for step in range(100)]
+    assert sides == [8] * 30 + [4] * 30 + [2] * 30 + [1] * 10
+    assert block_side(0, DataConfig()) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -245,3 +246,37 @@ def test_spherical_harmonics_have_the_right_gradients() -> None:
     directions = torch.randn(4, 3, dtype=torch.float64)
     directions = torch.nn.functional.normalize(directions, dim=-1).requires_grad_()
     assert torch.autograd.gradcheck(spherical_harmonics, (directions,))
+
+
+LATE = HashGridConfig(
+    num_levels=5, min_res=4, max_res=40, log2_table_size=9, start_levels=2, steps_per_level=10
+)
+
+
+def test_levels_enter_one_after_the_other() -> None:
+    grid = HashGrid(LATE)
+    assert [grid.levels_at(step) for step in (0, 9, 10, 29, 30, 1000)] == [2, 2, 3, 4, 5, 5]
+    assert HashGrid(replace(LATE, start_levels=0)).levels_at(0) == 5
+    assert HashGrid(replace(LATE, start_levels=9)).levels_at(0) == 5
+
+
+@pytest.mark.parametrize("engine", ["plain", "fast"])
+def test_levels_that_wait_are_zero_and_learn_nothing(engine: str) -> None:
+    torch.manual_seed(0)
+    grid = HashGrid(LATE)
+    grid.engine = engine
+    points = torch.rand(50, 3)
+    everything = grid(points).detach()
+    grid.active_levels = 2
+    features = grid(points)
+    # Whoever reads all levels, as renderers do, sees the same as long as the others wait.
+    assert torch.equal(features, everything)
+    assert bool((features[:, 4:] == 0.0).all())
+    assert bool((features[:, :4] != 0.0).any(dim=0).all())
+    features.square().sum().backward()
+    grid.active_levels = 5
+    gradient = grid.table.grad
+    assert gradient is not None
+    first = int(grid.offsets[2])
+    assert float(gradient[:first].abs().sum()) > 0.0
+    assert float(gradient[first:].abs().sum()) == 0.0

@@ -12,15 +12,27 @@ import torch
 
 from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.checkpoint import load_checkpoint
-from pipelines.nerf.config import TensorGridConfig
-from pipelines.nerf.data import ImageData
+from pipelines.nerf.config import (
+    DataConfig,
+    NerfactoConfig,
+    OptimizerConfig,
+    TensorGridConfig,
+)
+from pipelines.nerf.data import ImageData, PixelSampler
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.metrics import psnr
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.renderer import Renderer
-from pipelines.nerf.training import TrainProgress, train
-from pipelines.nerf.training_state import learning_rate
+from pipelines.nerf.training import (
+    GpuSteps,
+    StepShape,
+    TrainProgress,
+    begin_step,
+    optimise_once,
+    train,
+)
+from pipelines.nerf.training_state import initial_state, learning_rate
 from tests.unit.pipelines.nerf.toy_scene import (
     RADIUS,
     SIZE,
@@ -285,3 +297,71 @@ def test_images_and_cameras_must_fit(images: ImageData, cameras: Cameras) -> Non
         train(images, cameras.resized(16), [0], tiny_config(), seed=0)
     with pytest.raises(NerfError, match="no image to train on"):
         train(images, cameras, [], tiny_config(), seed=0)
+
+
+@pytest.mark.parametrize("engine", ["plain", "fast"])
+def test_a_run_with_coarse_images_and_late_levels_resumes_to_the_bit(
+    images: ImageData, cameras: Cameras, tmp_path: Path, engine: str
+) -> None:
+    config = tiny_config(
+        max_steps=20,
+        engine=engine,
+        data=DataConfig(long_side_px=SIZE, coarse_steps=12, coarse_halvings=2),
+    )
+    assert isinstance(config.model, NerfactoConfig)
+    late = replace(config.model.grid, start_levels=2, steps_per_level=4)
+    config = with_model(config, grid=late)
+    path = tmp_path / "checkpoint.pt"
+    whole = train(images, cameras, list(range(8)), config, seed=3)
+    short = replace(config, max_steps=9)
+    begun = train(images, cameras, list(range(8)), short, seed=3, checkpoint_path=path)
+    assert isinstance(begun, Nerfacto)
+    first = int(begun.field.grid.offsets[4])  # step 8 lets in the fourth level
+    assert not begun.field.grid.table[first:].any()
+    resumed = train(images, cameras, list(range(8)), config, seed=3, checkpoint_path=path)
+    assert _same_parameters(whole, resumed)
+    assert isinstance(resumed, Nerfacto)
+    assert resumed.field.grid.table[first:].any()
+
+
+def test_steps_of_the_gpu_engine_change_their_shape_as_those_of_the_loop(
+    images: ImageData, cameras: Cameras
+) -> None:
+    config = tiny_config(data=DataConfig(long_side_px=SIZE, coarse_steps=6, coarse_halvings=2))
+    assert isinstance(config.model, NerfactoConfig)
+    late = replace(config.model.grid, start_levels=2, steps_per_level=4)
+    config = with_model(config, grid=late)
+    cpu = torch.device("cpu")
+    posed = cameras.select(range(8))
+    states = []
+    shapes: list[StepShape] = []
+    for on_gpu in (False, True):
+        state = initial_state(config, 8, 3, cpu)
+        sampler = PixelSampler(images, range(8))
+        graphs = GpuSteps(state, sampler, posed)  # on a CPU without graphs
+        state.model.train()
+        for _ in range(9):
+            shapes.append(begin_step(state, config))
+            if on_gpu:
+                graphs.run(state, config, shapes[-1], check=False)
+            else:
+                optimise_once(state, sampler, posed, config, shapes[-1], check=True)
+        states.append(state)
+    assert shapes[:9] == shapes[9:]
+    assert [shape.block for shape in shapes[:9]] == [4] * 3 + [2] * 3 + [1] * 3
+    assert [shape.levels[0] for shape in shapes[:9]] == [2] * 4 + [3] * 4 + [4]
+    assert _same_parameters(states[0].model, states[1].model)
+
+
+@pytest.mark.parametrize("engine", ["plain", "fast"])
+def test_adam_remembers_squares_as_long_as_the_options_say(engine: str) -> None:
+    config = tiny_config(engine=engine, optimizer=OptimizerConfig(beta2=0.9))
+    state = initial_state(config, 3, 0, torch.device("cpu"))
+    (parameter, *_) = state.optimizers["networks"].param_groups[0]["params"]
+    for gradient in (2.0, 0.0):
+        parameter.grad = torch.full_like(parameter, gradient)
+        state.optimizers["networks"].step()
+    # v = beta2 ((1 - beta2) 2^2) after a gradient of 2 and one of 0.
+    second = state.optimizers["networks"].state[parameter]["exp_avg_sq"]
+    assert torch.allclose(second, torch.tensor(0.9 * 0.1 * 4.0))
+    assert {g["betas"] for o in state.optimizers.values() for g in o.param_groups} == {(0.9, 0.9)}

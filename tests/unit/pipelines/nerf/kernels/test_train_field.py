@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -343,3 +344,23 @@ def test_refuses_inputs_that_do_not_fit() -> None:
         render_field(*rays, batch.t_edges[:2], batch.codes, field, "black")
     with pytest.raises(ValueError, match="no background 'red'"):
         render_field(*rays, batch.t_edges, batch.codes, field, "red")
+
+
+def test_levels_that_wait_count_nothing_and_are_left_alone() -> None:
+    grid = replace(GRID, start_levels=2)
+    field = random_field(grid=grid)
+    first = int(field.grid.offsets[2])
+    with torch.no_grad():
+        field.grid.table[first:] = 0.0
+    batch = Batch(37, 13, 6)
+    everything = fast(field, batch, "last_sample")
+    field.grid.active_levels = 2
+    found = fast(field, batch, "last_sample")
+    expected = plain_twin(field, batch, "last_sample")
+    assert_equal_to_rounding(found, expected)
+    for value, same in zip(found[0], everything[0], strict=True):
+        assert torch.equal(value, same)
+    table = len(batch.inputs())  # the first of the parameters
+    assert found[1][table].shape == field.grid.table.shape
+    assert float(found[1][table][first:].abs().sum()) == 0.0
+    assert float(everything[1][table][first:].abs().sum()) > 0.0

@@ -248,3 +248,19 @@ def test_training_with_all_parts_follows_the_plain_run(threads: int) -> None:
     plain, fast = losses(fast=False), losses(fast=True)
     assert plain[-1] < 0.7 * plain[0]
     assert fast == pytest.approx(plain, rel=1e-4)
+
+
+def test_levels_that_wait_are_left_alone(threads: int) -> None:
+    network = random_network(SMALL)
+    first = int(network.grid.offsets[2])
+    with torch.no_grad():
+        network.grid.table[first:] = 0.0
+    network.grid.active_levels = 2
+    rays, upstream = random_rays(37, 40), torch.randn(37, 40)
+    found = proposal_weights(*rays, network)
+    expected = plain_weights(rays, network)
+    assert (found - expected).abs().max() < 2e-5
+    table, *_ = gradients(found, network, upstream)
+    truth, *_ = gradients(expected, network, upstream)
+    assert float(table[first:].abs().sum()) == 0.0
+    assert (table - truth).abs().max() <= 1e-3 * truth.abs().max()

@@ -264,3 +264,46 @@ def test_impossible_options_are_refused() -> None:
     ):
         with pytest.raises(NerfError, match=text):
             validate(_config(5, **wrong))
+
+
+def test_rays_of_a_step_follow_the_samples_that_they_have() -> None:
+    model = _model(samples_per_step=4000).train()
+    assert model.rays_of_step(256) == 256  # nothing is known yet
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for step in range(12):
+        num_rays = model.rays_of_step(256)
+        assert num_rays % 16 == 0
+        plan = model.plan_step(step, generator)
+        rays = _rays(num_rays)
+        outputs = model(rays, plan=plan, generator=generator)
+        assert int(outputs["extra"]["kept"].sum()) == num_rays
+        model.finish_step(plan)
+        found.append(num_rays)
+    # The field stands still, so that a ray's samples do too, but for those the jitter moves.
+    assert model.samples_per_ray * found[-1] == pytest.approx(4000, rel=0.1)
+    assert model.rays_of_step(256) == pytest.approx(4000 / model.samples_per_ray, abs=8.5)
+    assert _model().rays_of_step(256) == 256
+
+
+def test_rays_of_a_step_are_bounded() -> None:
+    model = _model(samples_per_step=4000)
+    model.load_schedule_state({"samples_per_ray": 1e-3})
+    assert model.rays_of_step(256) == 16 * 256
+    model.load_schedule_state({"samples_per_ray": 1e9})
+    assert model.rays_of_step(256) == 16
+
+
+def test_a_resumed_run_has_the_rays_of_an_uninterrupted_one(
+    capture: Capture, tmp_path: Path
+) -> None:
+    images, cameras, learned, _ = capture
+    config = _config(14, samples_per_step=3000, occupancy_update_every=2)
+    path = tmp_path / "checkpoint.pt"
+    whole = train(images, cameras, learned, config, seed=1)
+    train(images, cameras, learned, replace(config, max_steps=6), seed=1, checkpoint_path=path)
+    resumed = train(images, cameras, learned, config, seed=1, checkpoint_path=path)
+    assert same_state(whole, resumed)
+    assert isinstance(whole, InstantNgp)
+    assert isinstance(resumed, InstantNgp)
+    assert whole.samples_per_ray == resumed.samples_per_ray > 0.0
