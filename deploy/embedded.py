@@ -157,8 +157,11 @@ class Embedded:
         }
         return {**os.environ, **own, **outside}
 
-    def programs(self, slots: int = 1) -> list[Program]:
-        """Redis (unless there is one outside), the API and one worker, in order of start."""
+    def programs(self, slots: int | None = None) -> list[Program]:
+        """Redis (unless there is one outside), the API and one worker, in order of start.
+
+        slots: stages that run at the same time; None lets the worker choose.
+        """
         environment = self.environment()
         logs = self.home / "logs"
         programs = []
@@ -181,7 +184,7 @@ class Embedded:
                 name="worker",
                 command=[
                     *(sys.executable, "-m", "worker", "--id", f"embedded-{self.home.name}"),
-                    *("--slots", str(slots), "--queues", "cpu,gpu,light"),
+                    *("--queues", "cpu,gpu,light", *(("--slots", str(slots)) if slots else ())),
                 ],
                 environment=environment,
                 log=logs / "worker.log",
@@ -220,7 +223,7 @@ class Embedded:
             ready_s=20.0,
         )
 
-    def supervisor(self, say: Callable[[str], None], slots: int = 1) -> Supervisor:
+    def supervisor(self, say: Callable[[str], None], slots: int | None = None) -> Supervisor:
         """What runs it all."""
         return Supervisor(self.programs(slots), say=say)
 

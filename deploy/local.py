@@ -38,7 +38,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="nerfworks up", description=__doc__)
     parser.add_argument("--host", default=os.environ.get("HOST", "127.0.0.1"))
     parser.add_argument("--port", type=int, default=int(os.environ.get("PORT", "8000")))
-    parser.add_argument("--slots", type=int, default=1, help="stages that run at the same time")
+    parser.add_argument("--slots", type=int, help="stages at the same time; the worker chooses")
     return parser.parse_args(arguments)
 
 

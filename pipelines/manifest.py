@@ -19,6 +19,7 @@ import logging
 import os
 import platform
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -129,8 +130,8 @@ def write_manifest(
 ) -> dict[str, Any]:
     """Hash a stage's folder and write its manifest, the last file to appear in it.
 
-    summary: what the stage returned. timings: seconds by name. inputs: manifests of what it read.
-    Returns the manifest.
+    summary: what the stage returned. timings: seconds by name, see `run_stage`.
+    inputs: manifests of what it read. Returns the manifest.
     """
     files = list_files(folder)
     manifest = {
@@ -175,7 +176,10 @@ def run_stage(
     """Run a stage on a job's folder and publish its result as `workspace.stage(name)`.
 
     options_values: of this stage, as `resolve_options` gives them.
-    Returns the manifest. Raises what the stage raises; a full disk and a lack of memory become
+    Returns the manifest; in its timings `wall_s` is the whole without hashing and publishing, of
+    which `load_s` went into hashing inputs and importing the stage's code, and `compile_s` into
+    compiling kernels. A worker adds what lies around (`worker.runner`).
+    Raises what the stage raises; a full disk and a lack of memory become
     ResourceError (disk_full, out_of_memory). What a failed stage wrote is removed, its checkpoint
     stays; a stage that succeeds has no checkpoint any more.
     """
@@ -198,12 +202,18 @@ def run_stage(
         is_cancelled=hooks.is_cancelled,
         on_checkpoint=hooks.on_checkpoint,
     )
-    begun = time.monotonic()
+    begun, compiled = time.monotonic(), _compile_seconds()
     try:
         with _translated(stage):
             inputs = input_manifests(stage, workspace)
-            summary = load_function(stage)(options, context)
-            timings = {"wall_s": round(time.monotonic() - begun, 3)}
+            function = load_function(stage)
+            loaded_s = time.monotonic() - begun
+            summary = function(options, context)
+            timings = {
+                "wall_s": round(time.monotonic() - begun, 3),
+                "load_s": round(loaded_s, 3),
+                "compile_s": round(_compile_seconds() - compiled, 3),
+            }
             manifest = write_manifest(
                 out, stage, options.model_dump(mode="json"), summary, timings, inputs, seed=seed
             )
@@ -213,6 +223,12 @@ def run_stage(
         raise
     shutil.rmtree(checkpoint, ignore_errors=True)
     return manifest
+
+
+def _compile_seconds() -> float:
+    """Seconds that this process spent on compiling kernels, without loading the compiler for it."""
+    runtime = sys.modules.get("pipelines.nerf.kernels.runtime")
+    return 0.0 if runtime is None else float(runtime.compile_seconds())
 
 
 def _remove(folder: Path) -> None:

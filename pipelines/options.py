@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
@@ -27,6 +27,7 @@ from pipelines.nerf.config import (
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.evaluation_config import EvaluateConfig
 from pipelines.nerf.plugins import Method
+from pipelines.nerf.render_config import RenderConfig
 from pipelines.registry import STAGE_NAMES
 
 
@@ -75,12 +76,21 @@ class PosesOptions(StageOptions):
         1600, ge=240, le=8192, description="Features are found at this long side, in pixels."
     )
     num_features: int = Field(8192, ge=256, le=65536, description="Most features per image.")
-    matcher: Literal["auto", "sequential", "exhaustive"] = Field(
+    upsample: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="Which pairs are matched: auto is sequential for videos, else exhaustive.",
+        description="Double images before looking for features: finds more of them, for three "
+        "times the work. auto does so where images show few.",
+    )
+    matcher: Literal["auto", "sequential", "exhaustive", "retrieval"] = Field(
+        "auto",
+        description="Which pairs are matched at first. auto is all pairs of few images, "
+        "neighbours in time of a video's frames, and neighbours in looks of many photos.",
     )
     sequential_overlap: int = Field(
         10, ge=1, le=100, description="Neighbours matched on each side in a sequence."
+    )
+    retrieval_neighbours: int = Field(
+        20, ge=1, le=200, description="Photos most alike that each photo is matched with."
     )
     camera_model: Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"] = Field(
         "OPENCV", description="Lens model that is fitted."
@@ -95,8 +105,8 @@ class PosesOptions(StageOptions):
         0.8,
         ge=0,
         le=1,
-        description="Below this share of registered images, all pairs are matched and thresholds "
-        "relaxed.",
+        description="Below this share of registered images, poses are sought again, thoroughly: "
+        "all pairs, then lower thresholds.",
     )
     refine_principal_point: bool = Field(
         False, description="Fit the principal point too; needs many views."
@@ -105,9 +115,24 @@ class PosesOptions(StageOptions):
         "auto", description="Turn the world so that gravity points along -Z."
     )
     num_threads: int = Field(-1, ge=-1, le=1024, description="Threads; -1 for all.")
+    memory_mb: int = Field(
+        4000,
+        ge=100,
+        le=1_000_000,
+        description="Memory for finding features: where large images would take more, fewer are "
+        "worked on at a time. Unit: 10^6 bytes.",
+    )
 
 
-class CropOptions(StageOptions):
+class RenderingOptions(StageOptions):
+    """Common to the stages that render."""
+
+    render: RenderOptions = Field(
+        default_factory=lambda: RenderOptions(), description="What rendering leaves out."
+    )
+
+
+class CropOptions(RenderingOptions):
     """What part of the scene is exported, common to mesh and point cloud."""
 
     max_distance: float = Field(
@@ -143,7 +168,7 @@ class MeshOptions(CropOptions):
     )
 
 
-class VideoOptions(StageOptions):
+class VideoOptions(RenderingOptions):
     """The video along the captured path."""
 
     num_frames: int = Field(240, ge=8, le=20_000, description="Frames rendered.")
@@ -254,6 +279,11 @@ def train_options(method: str) -> type[StageOptions]:
 TrainOptions: type[StageOptions] = train_options(NERFACTO.name)
 """`TrainConfig` with the options of the default method, checked."""
 
+if TYPE_CHECKING:
+    RenderOptions = StageOptions
+else:
+    RenderOptions = _model_of(RenderConfig)
+
 EvaluateOptions: type[StageOptions] = _model_of(EvaluateConfig)
 """`EvaluateConfig`, checked."""
 
@@ -267,6 +297,12 @@ def train_config(options: StageOptions) -> TrainConfig:
 def evaluate_config(options: StageOptions) -> EvaluateConfig:
     """What the evaluation understands, from checked options."""
     config: EvaluateConfig = config_from_dict(EvaluateConfig, options.model_dump())
+    return config
+
+
+def render_config(options: RenderingOptions) -> RenderConfig:
+    """What the renderer understands, from checked options."""
+    config: RenderConfig = config_from_dict(RenderConfig, options.render.model_dump())
     return config
 
 

@@ -30,7 +30,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=1,
+        version=2,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",

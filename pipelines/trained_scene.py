@@ -25,6 +25,7 @@ from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.checkpoint import load_model
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Appearance, Model
+from pipelines.nerf.render_config import RenderConfig
 from pipelines.nerf.renderer import RenderedImage, Renderer
 from pipelines.nerf.training_state import choose_device
 from pipelines.scene_bounds import SceneBounds, scene_bounds
@@ -96,26 +97,33 @@ class TrainedScene:
     """A model, its scene space and its cameras.
 
     cameras: all cameras of the training run with their split, in the order of the walk as far as
-        names tell. extras: whatever else training wrote about the run.
+        names tell. extras: whatever else training wrote about the run. render_config: what
+        rendering leaves out; None for the defaults.
     """
 
     def __init__(
-        self, model: Model, scene: SceneTransform, cameras: CamerasFile, extras: dict[str, Any]
+        self,
+        model: Model,
+        scene: SceneTransform,
+        cameras: CamerasFile,
+        extras: dict[str, Any],
+        render_config: RenderConfig | None = None,
     ) -> None:
         use_all_cores()
         self.model = model
         self.scene = scene
         self.cameras = cameras
         self.extras = extras
-        self._renderer = Renderer(model, scene)
+        self.renderer = Renderer(model, scene, config=render_config)
 
     @classmethod
-    def load(cls, path: Path) -> TrainedScene:
+    def load(cls, path: Path, render_config: RenderConfig | None = None) -> TrainedScene:
         """Read `model.zip`, onto the GPU where there is one. Raises ExportError for a bad file."""
         with nerf_errors_as(ExportError):
             loaded = load_model(path)
             model = loaded.model.to(choose_device("auto"))
-        return cls(model, loaded.scene, cameras_from_json(loaded.extras["cameras"]), loaded.extras)
+        cameras = cameras_from_json(loaded.extras["cameras"])
+        return cls(model, loaded.scene, cameras, loaded.extras, render_config)
 
     def training_images(self) -> list[PosedImage]:
         """The images that were trained on, in the file's order."""
@@ -144,7 +152,7 @@ class TrainedScene:
         with nerf_errors_as(ExportError):
             cameras = nerf_cameras([lens], [pose], self.scene)
             sized = cameras.resized(long_side) if long_side else cameras
-            return self._renderer.render(sized, 0, appearance=appearance)
+            return self.renderer.render(sized, 0, appearance=appearance)
 
     def picture(self, lens: Pinhole, pose: Floats) -> NDArray[np.uint8]:
         """[H, W, 3] uint8: an undistorted picture."""

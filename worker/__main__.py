@@ -23,10 +23,11 @@ from storage.settings import StorageSettings
 from worker.app import make_app
 from worker.consumer import ConsumerLink
 from worker.housekeeping import detect_gpu
-from worker.runtime import WorkerIdentity, WorkerRuntime, set_current_runtime
+from worker.runtime import WorkerIdentity, WorkerRuntime, num_cores, set_current_runtime
 from worker.settings import WorkerSettings
 
 EXIT_LIMIT_S = 20.0
+MANY_CORES = 8
 
 
 def _queues(text: str) -> tuple[str, ...]:
@@ -45,7 +46,11 @@ def _slots(text: str) -> int:
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m worker", description="Runs stages of jobs.")
-    parser.add_argument("--slots", type=_slots, default=1, help="stages at once (default 1)")
+    parser.add_argument(
+        "--slots",
+        type=_slots,
+        help=f"stages at once (default 1; 2 with a GPU or {MANY_CORES} processor cores)",
+    )
     parser.add_argument(
         "--queues", type=_queues, default=QUEUES, help=f"any of {','.join(QUEUES)} (default all)"
     )
@@ -55,6 +60,11 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
         help="a name that stays the same when this worker is started again",
     )
     return parser.parse_args(arguments)
+
+
+def default_slots(has_gpu: bool, cores: int) -> int:
+    """Stages at once where nobody says: docs/architecture.md, "Slots", has the measurements."""
+    return 2 if has_gpu or cores >= MANY_CORES else 1
 
 
 def _exit_in_time() -> None:
@@ -74,8 +84,10 @@ def main(arguments: list[str] | None = None) -> None:
     storage = StorageSettings()
     upgrade(storage.resolved_database_url)  # whoever starts first makes the schema
     link = ConsumerLink()
+    has_gpu = detect_gpu()
+    slots = chosen.slots or default_slots(has_gpu, num_cores())
     runtime = WorkerRuntime(
-        WorkerIdentity.of(chosen.id, chosen.slots, chosen.queues, detect_gpu()),
+        WorkerIdentity.of(chosen.id, slots, chosen.queues, has_gpu),
         storage,
         WorkerSettings(),
         registry=os.environ.get("NERFWORKS_REGISTRY", "pipelines.registry"),
@@ -97,7 +109,7 @@ def main(arguments: list[str] | None = None) -> None:
         make_app(storage).worker_main(
             [
                 "worker",
-                *("--pool", "threads", "--concurrency", str(chosen.slots)),
+                *("--pool", "threads", "--concurrency", str(slots)),
                 *("--queues", ",".join(runtime.identity.queues)),
                 *("--hostname", f"{chosen.id}@%h", "--loglevel", "INFO"),
                 *("--without-gossip", "--without-mingle", "--without-heartbeat"),

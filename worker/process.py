@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,17 +28,13 @@ _LINE_BYTES = 8_192
 _EXIT_WAIT_S = 5.0
 
 
-def scrubbed_environment(environment: Mapping[str, str], threads: int) -> dict[str, str]:
-    """The environment of a stage process: without keys and addresses of the service.
-
-    threads: how many the numeric libraries may use, where the environment does not say.
-    """
+def scrubbed_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment of a stage process: without keys and addresses of the service."""
     kept = {name: value for name, value in environment.items() if not _SECRET_NAME.search(name)}
     root = str(Path(__file__).resolve().parent.parent)
     paths = [root, *filter(None, kept.get("PYTHONPATH", "").split(os.pathsep))]
     kept["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
     kept["PYTHONUNBUFFERED"] = "1"
-    kept.setdefault("OMP_NUM_THREADS", str(threads))
     # OpenMP's waiting threads must not spin: see pipelines/__main__.py for what that costs.
     kept.setdefault("OMP_WAIT_POLICY", "passive")
     return kept
@@ -59,10 +55,12 @@ def oom_kills() -> int:
 class StageProcess:
     """A warm child. One run at a time; not safe for several threads at once.
 
+    registry: dotted name of the stages' registry. preload: names of
+    stages whose code it loads while it is idle.
     messages: what the child sent, ending with {"type": "exit"} when it is gone.
     """
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self, registry: str, preload: Sequence[str] = ()) -> None:
         self.messages: queue.Queue[dict[str, Any]] = queue.Queue()
         self._on_line: Callable[[str], None] = lambda line: None
         self._log_ended = threading.Event()
@@ -75,13 +73,14 @@ class StageProcess:
                 [
                     *(sys.executable, "-m", "worker.stage_process"),
                     *("--message-fd", str(message_write), "--life-fd", str(life_read)),
+                    *("--registry", registry, "--preload", *preload),
                 ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 pass_fds=(message_write, life_read),
                 start_new_session=True,
-                env=scrubbed_environment(os.environ, threads),
+                env=scrubbed_environment(os.environ),
             )
         finally:
             os.close(message_write)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -65,6 +66,8 @@ Result = TypeVar("Result")
 class Registry(Protocol):
     """What a registry module offers: `pipelines.registry`, or a test's own."""
 
+    STAGES: tuple[Stage, ...]
+
     def get_stage(self, name: str) -> Stage: ...
 
 
@@ -74,9 +77,29 @@ def load_registry(name: str) -> Registry:
     return module
 
 
+class Laps:
+    """Seconds of the parts of an attempt, one after the other. They end in the row's manifest.
+
+    fetch_s: bring the inputs. start_s: until the stage process has begun. run_s: the stage there,
+    with hashing and publishing its folder. store_s: bring the results to the object store.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._ended = time.monotonic()
+
+    def end(self, name: str) -> None:
+        """The part that ran since the last call, or since the start, was this one."""
+        moment = time.monotonic()
+        self.seconds[name] = round(moment - self._ended, 3)
+        self._ended = moment
+
+
 class Runner:
     """Runs attempts for one slot, in one warm process that is replaced when it dies.
 
+    registry: dotted name of the stages' registry. threads: says how many the numeric libraries of a
+    stage that starts now may use, where the environment's OMP_NUM_THREADS does not.
     shutdown: set when the worker ends; a running attempt then gives its stage back.
     """
 
@@ -88,7 +111,7 @@ class Runner:
         *,
         work_dir: Path,
         registry: str,
-        threads: int,
+        threads: Callable[[], int],
         shutdown: threading.Event,
     ) -> None:
         self._database = database
@@ -99,7 +122,16 @@ class Runner:
         self._registry = load_registry(registry)
         self._threads = threads
         self._shutdown = shutdown
+        self._preload: Sequence[str] = ()
         self._process: StageProcess | None = None
+
+    def prepare(self, preload: Sequence[str]) -> None:
+        """Start the process before there is anything to run.
+
+        preload: stages whose code it, and those that take its place, load while they are idle.
+        """
+        self._preload = preload
+        self._ensure_process()
 
     def close(self) -> None:
         """Kill the warm process."""
@@ -147,6 +179,7 @@ class Runner:
 
     def _attempt(self, claim: Claim, keeper: LeaseKeeper, prefix: str) -> dict[str, Any]:
         guard, workers = self._guard_of(keeper), self._settings.transfers
+        laps = Laps()
         stage = self._registry.get_stage(claim.name)
         with self._database.read_scope() as session:
             work = stage_work(session, claim)
@@ -158,12 +191,13 @@ class Runner:
         restore_checkpoint(
             self._store, workspace, stage.name, work.checkpoint_prefix, guard, workers=workers
         )
+        laps.end("fetch_s")
         uploader = CheckpointUploader(
             self._database, self._store, claim, self._lease_guard(keeper), workers=workers
         )
         finish = False
         try:
-            manifest = self._run_in_process(stage, claim, keeper, work, workspace, uploader)
+            manifest = self._run_in_process(stage, claim, keeper, work, workspace, uploader, laps)
         except (StageFailedError, StageCrashedError, StopRunError):
             finish = not (keeper.lost.is_set() or keeper.cancel_requested.is_set())
             raise
@@ -171,7 +205,8 @@ class Runner:
             limit_s = self._settings.cancel_grace_s if self._shutdown.is_set() else CHECKPOINT_END_S
             uploader.close(finish=finish, timeout_s=limit_s)
         upload_folder(self._store, workspace.stage(stage.name), prefix, guard, workers=workers)
-        return manifest
+        laps.end("store_s")
+        return {**manifest, "timings": {**manifest["timings"], **laps.seconds}}
 
     def _lease_guard(self, keeper: LeaseKeeper) -> Callable[[], None]:
         """A checkpoint is worth keeping also when the worker shuts down."""
@@ -189,7 +224,7 @@ class Runner:
     def _ensure_process(self) -> StageProcess:
         if self._process is None or not self._process.is_alive():
             self.close()
-            self._process = StageProcess(self._threads)
+            self._process = StageProcess(self._registry_name, self._preload)
         return self._process
 
     def _run_in_process(
@@ -200,6 +235,7 @@ class Runner:
         work: StageWork,
         workspace: Workspace,
         uploader: CheckpointUploader,
+        laps: Laps,
     ) -> dict[str, Any]:
         process = self._ensure_process()
         try:
@@ -207,13 +243,13 @@ class Runner:
                 f"{claim.token}-{claim.stage_id}",
                 keeper.log,
                 do="run",
-                registry=self._registry_name,
                 stage=stage.name,
                 options=work.options,
                 root=str(workspace.root),
                 seed=work.seed,
+                threads=int(os.environ.get("OMP_NUM_THREADS") or self._threads()),
             )
-            return self._follow(process, stage, keeper, uploader)
+            return self._follow(process, stage, keeper, uploader, laps)
         except BrokenPipeError:
             raise crash_of(stage.name, *process.exit_reason()) from None
         except StageCrashedError:
@@ -234,6 +270,7 @@ class Runner:
         stage: Stage,
         keeper: LeaseKeeper,
         uploader: CheckpointUploader,
+        laps: Laps,
     ) -> dict[str, Any]:
         """Take the process's messages until the stage has ended, or must."""
         guard = self._guard_of(keeper)
@@ -256,7 +293,10 @@ class Runner:
                 keeper.report(message["fraction"], message["message"], message["eta_s"])
             elif kind == "checkpoint":
                 uploader.offer(Snapshot(Path(message["path"]), message["files"]))
+            elif kind == "begun":
+                laps.end("start_s")
             elif kind == "done":
+                laps.end("run_s")
                 manifest: dict[str, Any] = message["manifest"]
                 return manifest
             elif kind == "failed":

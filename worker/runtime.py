@@ -2,6 +2,9 @@
 
 A message only wakes a slot. A slot that has ended a stage goes on with whatever else this worker
 may take, oldest job first: the next stage of the same job finds its inputs on this machine.
+
+Of several slots one at a time runs on the GPU, whose memory is not to be shared; the others take
+what needs none. A stage starts with the processor's cores divided by the slots that are busy then.
 """
 
 from __future__ import annotations
@@ -22,8 +25,9 @@ from storage.queries import WaitingStage, ready_unclaimed
 from storage.queue import QUEUE_GPU, Bell, queue_for
 from storage.records import forget_worker, has_live_gpu, register_worker
 from storage.settings import StorageSettings
+from worker.compiling import KernelCompiler
 from worker.housekeeping import Housekeeping
-from worker.runner import Runner
+from worker.runner import Runner, load_registry
 from worker.settings import WorkerSettings
 
 _log = logging.getLogger("nerfworks.worker")
@@ -44,6 +48,21 @@ class WorkerIdentity:
         comes over the queue `cpu`."""
         served = tuple(name for name in queues if has_gpu or name != QUEUE_GPU)
         return cls(worker_id, slots, served, has_gpu)
+
+
+def num_cores() -> int:
+    """Processors that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A claim, and whether it holds the worker's GPU."""
+
+    claim: Claim
+    on_gpu: bool
 
 
 class WorkerRuntime:
@@ -68,6 +87,9 @@ class WorkerRuntime:
         self._bell = Bell(storage.redis_url)
         self._direct = ThreadPoolExecutor(identity.slots, thread_name_prefix="direct")
         self._free: queue.SimpleQueue[Runner] = queue.SimpleQueue()
+        self._gpu = threading.Lock()  # held by the slot whose stage runs on the GPU
+        self._stages = load_registry(registry).STAGES
+        self._compiler = KernelCompiler()
         self._runners = [
             Runner(
                 self._database,
@@ -75,7 +97,7 @@ class WorkerRuntime:
                 settings,
                 work_dir=storage.work_dir,
                 registry=registry,
-                threads=max((os.cpu_count() or 1) // identity.slots, 1),
+                threads=self._threads_now,
                 shutdown=self.shutdown,
             )
             for _ in range(identity.slots)
@@ -99,6 +121,7 @@ class WorkerRuntime:
         if freed:
             _log.warning("a former self of this worker left: %s", ", ".join(freed))
         self._register()
+        self._prepare()
         self._bell.ring(self._database, freed)
         self._housekeeping.start()
 
@@ -109,6 +132,7 @@ class WorkerRuntime:
         self._direct.shutdown(wait=True)
         for runner in self._runners:
             runner.close()
+        self._compiler.stop()
         with self._database.session_scope() as session:
             forget_worker(session, self.identity.id)
         self._bell.close()
@@ -121,21 +145,39 @@ class WorkerRuntime:
         except queue.Empty:
             return  # the database remembers the stage; a slot that ends its work looks there
         try:
-            claim = self._claim(stage_id) if stage_id else None
-            while not self.shutdown.is_set():
-                claim = claim or self._claim_next()
-                if claim is None:
-                    return
-                ready = runner.run(claim)
-                claim = self._claim_next() if not self.shutdown.is_set() else None
-                taken = claim.stage_id if claim else None
-                self._bell.ring(self._database, [key for key in ready if key != taken])
+            taken = self._take(stage_id)
+            while taken is not None:
+                try:
+                    ready = runner.run(taken.claim)
+                finally:
+                    if taken.on_gpu:
+                        self._gpu.release()
+                taken = self._take()
+                mine = taken.claim.stage_id if taken else None
+                self._bell.ring(self._database, [key for key in ready if key != mine])
         finally:
             self._free.put(runner)
 
     def sweep(self) -> None:
         """Delete the bytes of deleted records now."""
         self._housekeeping.clean()
+
+    def _prepare(self) -> None:
+        """Start what makes the first job as fast as the second."""
+        if not self._settings.prepare:
+            return
+        with self._database.read_scope() as session:
+            gpu_is_live = has_live_gpu(session)
+        mine = [
+            stage
+            for stage in self._stages
+            if queue_for(stage.needs_gpu, gpu_is_live) in self.identity.queues
+        ]
+        for runner in self._runners:
+            runner.prepare([stage.name for stage in mine])
+        trains = any(stage.run.startswith("pipelines.stages.train:") for stage in mine)
+        if trains and not self.identity.has_gpu:
+            self._compiler.start()
 
     def _register(self) -> None:
         with self._database.session_scope() as session:
@@ -154,7 +196,7 @@ class WorkerRuntime:
             return claim_stage(session, stage_id, self.identity.id, self._settings.lease_s)
 
     def _waiting(self, older_than_s: float) -> list[WaitingStage]:
-        """Ready stages that this worker may take; GPU stages first where it has a GPU."""
+        """Ready stages that this worker may take now; GPU stages first where it has a GPU."""
         with self._database.read_scope() as session:
             waiting = ready_unclaimed(session, older_than_s)
             gpu_is_live = bool(waiting) and has_live_gpu(session)
@@ -165,13 +207,32 @@ class WorkerRuntime:
         ]
         if self.identity.has_gpu:
             mine.sort(key=lambda stage: not stage.needs_gpu)
+            if self._gpu.locked():
+                mine = [stage for stage in mine if not stage.needs_gpu]
         return mine
 
-    def _claim_next(self) -> Claim | None:
-        for stage in self._waiting(0.0):
-            if claim := self._claim(stage.id):
-                return claim
+    def _take(self, wanted: str | None = None) -> _Taken | None:
+        """Claim the wanted stage, or else the next that waits; its GPU is then this slot's."""
+        if self.shutdown.is_set():
+            return None
+        for stage in sorted(self._waiting(0.0), key=lambda stage: stage.id != wanted):
+            on_gpu = stage.needs_gpu and self.identity.has_gpu
+            if on_gpu and not self._gpu.acquire(blocking=False):
+                continue
+            claim: Claim | None = None
+            try:
+                claim = self._claim(stage.id)
+            finally:
+                if on_gpu and claim is None:
+                    self._gpu.release()
+            if claim is not None:
+                return _Taken(claim, on_gpu)
         return None
+
+    def _threads_now(self) -> int:
+        """A fair share of the processor for a stage that starts now."""
+        busy = self.identity.slots - self._free.qsize()
+        return max(num_cores() // max(busy, 1), 1)
 
     def _offer(self) -> None:
         if self._free.empty() or self.shutdown.is_set():

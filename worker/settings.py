@@ -30,3 +30,8 @@ class WorkerSettings(BaseSettings):
         5.0, ge=0, description="A stage that was asked to stop is killed after so long."
     )
     transfers: int = Field(4, ge=1, le=64, description="Files moved at once by one slot.")
+    prepare: bool = Field(
+        True,
+        description="Start stage processes, load their code and compile kernels before a job "
+        "comes; without it an idle worker takes less memory, and its first job longer.",
+    )

@@ -3,9 +3,9 @@
 It reads commands as JSON lines from stdin and writes messages as JSON lines to a descriptor of its
 own; what stages print to stdout and stderr are log lines.
 
-    commands:  {"do": "run", "registry", "stage", "options", "root", "seed", "run_id"}
+    commands:  {"do": "run", "stage", "options", "root", "seed", "threads", "run_id"}
                {"do": "cancel", "run_id"}
-    messages:  {"type": "hello", "pid"}
+    messages:  {"type": "hello", "pid"} | {"type": "begun"}, the first of a run
                {"type": "progress", "fraction", "message", "eta_s"}
                {"type": "checkpoint", "path", "files": {name: [bytes, mtime_ns]}}
                {"type": "done", "manifest"} | {"type": "failed", "error"} | {"type": "cancelled"}
@@ -15,6 +15,9 @@ It never outlives its worker. A guardian, forked before anything heavy is loaded
 of a pipe that only the worker holds open, and then kills the whole process group: also where the
 main thread sits in a long native call and no Python thread can run, and with it the programs that
 a stage started. When the stage process itself ends, the guardian kills what it left behind.
+
+While nothing is asked of it, it loads the code of the stages that it may be given
+(`worker.preloading`), piece by piece; a command waits for one piece at most.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +45,7 @@ from pipelines.errors import Cancelled, PipelineError, ResourceError
 from pipelines.manifest import RunHooks, run_stage
 from pipelines.workspace import Workspace
 from worker.locks import folder_lock
+from worker.preloading import preload_steps
 
 END_OF_LOG = "\x01end-of-log "
 GUARDIAN_STEP_S = 0.5
@@ -124,7 +129,10 @@ class Messages:
 class Run:
     """One run of one stage."""
 
-    def __init__(self, command: dict[str, Any], messages: Messages, cancelled: set[str]) -> None:
+    def __init__(
+        self, command: dict[str, Any], messages: Messages, cancelled: set[str], registry: str
+    ) -> None:
+        self._registry = registry
         self._run_id: str = command["run_id"]
         self._stage_name: str = command["stage"]
         self._command = command
@@ -136,6 +144,9 @@ class Run:
 
     def execute(self) -> None:
         """Run the stage and send how it ended."""
+        self._messages.send("begun")
+        # What stages and libraries that they load for the first time ask (`use_all_cores`).
+        os.environ["OMP_NUM_THREADS"] = str(self._command["threads"])
         try:
             with folder_lock(
                 self._workspace.root, f"run-{self._stage_name}", PREDECESSOR_TIMEOUT_S
@@ -157,7 +168,7 @@ class Run:
         self._messages.send(ending[0], **ending[1])
 
     def _run(self) -> dict[str, Any]:
-        registry = importlib.import_module(self._command["registry"])
+        registry = importlib.import_module(self._registry)
         return run_stage(
             registry.get_stage(self._stage_name),
             self._command["options"],
@@ -208,9 +219,21 @@ def read_commands(commands: queue.Queue[dict[str, Any]], cancelled: set[str]) ->
     kill_group()
 
 
+def next_command(commands: queue.Queue[dict[str, Any]], pieces: Iterator[object]) -> dict[str, Any]:
+    """The next command; until there is one, do one piece of what can be done in advance."""
+    while commands.empty() and next(pieces, None) is not None:
+        tidy_memory()
+    return commands.get()
+
+
 def tidy_memory() -> None:
-    """Give back what the last stage held: the process stays, its caches need not."""
+    """Give back what the last stage held: the process stays, its caches need not.
+
+    What outlives a collection is code and tables of modules; freezing it makes the next collection
+    look at what is new only. Without, each stage would begin some tenths of a second later.
+    """
     gc.collect()
+    gc.freeze()
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.empty_cache()
@@ -221,6 +244,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Runs stages for a worker; not for people.")
     parser.add_argument("--message-fd", type=int, required=True)
     parser.add_argument("--life-fd", type=int, required=True)
+    parser.add_argument("--registry", required=True)
+    parser.add_argument("--preload", nargs="*", default=[], help="stages to load in advance")
     arguments = parser.parse_args()
     start_guardian(arguments.life_fd, arguments.message_fd)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -235,9 +260,10 @@ def main() -> None:
     cancelled: set[str] = set()
     threading.Thread(target=read_commands, args=(commands, cancelled), daemon=True).start()
     messages.send("hello", pid=os.getpid())
+    pieces = preload_steps(arguments.registry, arguments.preload)
     while True:
-        command = commands.get()
-        Run(command, messages, cancelled).execute()
+        command = next_command(commands, pieces)
+        Run(command, messages, cancelled, arguments.registry).execute()
         cancelled.discard(command["run_id"])
         tidy_memory()
 

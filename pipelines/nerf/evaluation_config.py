@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from pipelines.nerf.config import option
+from pipelines.nerf.render_config import RenderConfig
 
 
 @dataclass(frozen=True)
@@ -51,3 +52,7 @@ class EvaluateConfig:
     floaters: bool = option(True, "Measure floaters on renders off the path.")
     floater_views: int = option(4, "Off-path views rendered for it.", ge=2, le=1000)
     floater_long_side_px: int = option(64, "Long side of those renders.", unit="px", ge=16, le=4096)
+    render: RenderConfig = field(
+        default_factory=RenderConfig,
+        metadata={"help": "What rendering leaves out; as in the stages whose pictures it judges."},
+    )

@@ -1,15 +1,16 @@
 """A trained model and a camera -> pictures, in tiles of bounded memory.
 
-On the CPU the whole forward pass runs in a compiled kernel (`kernels.render_rays`) where that knows
-the model; elsewhere, or with engine "plain", the model itself is asked in chunks. Depths are
-distances along the ray in world units, not z. Symbols: R rays, H and W of a picture.
+Where they know the model, the whole forward pass runs in a compiled kernel on the CPU
+(`kernels.render_rays`) and in large tiles on a GPU (`gpu.render`); elsewhere, or with engine
+"plain", the model itself is asked in chunks. Depths are distances along the ray in world units, not
+z. Symbols: R rays, H and W of a picture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,9 +20,16 @@ from torch import Tensor
 from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Appearance, Model
+from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.rays import Rays
+from pipelines.nerf.render_config import RenderConfig
+
+if TYPE_CHECKING:
+    from pipelines.nerf.kernels.render_grid import BakedGrid
 
 FloatArray = NDArray[np.float32]
+Drawer = Callable[[Rays], dict[str, FloatArray]]
+"""From rays to the fields of `RenderedImage` by name, depths in scene units."""
 Progress = Callable[[float], None]
 
 FAST_TILE_RAYS = 8192
@@ -60,10 +68,10 @@ class Renderer:
     """Renders a model that others may go on training: its state is read anew in every call.
 
     model: is moved to `device` where one is given. scene: gives the world's unit.
-    engine: "fast" is the compiled kernel, on the CPU only; "plain" the model in PyTorch; "auto" is
-        fast on the CPU where the kernel knows the model, and plain elsewhere.
-    early_stop, weight_threshold: what the fast engine may leave out, see `kernels.render_rays`;
-        with both at 0 it agrees with the plain one to rounding.
+    engine: "fast" is the compiled kernel on the CPU, `gpu.render` on a GPU; "plain" the model in
+        PyTorch; "auto" is fast on the CPU where the kernel knows the model, and plain elsewhere.
+    config: what the fast engine may leave out; with `ALL_SAMPLES` it agrees with the plain one to
+        rounding.
     normals: also render normals, which needs a model that learned them and the plain engine.
     Raises NerfError `bad_config` for an unknown engine, or for "fast" where it cannot be.
     """
@@ -75,26 +83,27 @@ class Renderer:
         *,
         engine: str = "auto",
         device: torch.device | str | None = None,
-        early_stop: float = 1e-3,
-        weight_threshold: float = 1e-3,
+        config: RenderConfig | None = None,
         normals: bool = False,
     ) -> None:
         self._model = model if device is None else model.to(device)
         self._scene = scene
         self._device = next(model.parameters()).device
-        self._early_stop = early_stop
-        self._weight_threshold = weight_threshold
+        self._config = RenderConfig() if config is None else config
+        self._baked: BakedGrid | None = None
         if engine not in ("auto", "plain", "fast"):
             raise NerfError(
                 "bad_config", f"There is no engine {engine}.", "Use auto, plain or fast."
             )
         on_cpu = self._device.type == "cpu"
-        is_fast = engine != "plain" and on_cpu and not normals and _kernel_knows(model)
+        # On a GPU the fast engine must be asked for, until it has been measured on one.
+        wanted = engine == "fast" or (engine == "auto" and on_cpu)
+        is_fast = wanted and not normals and _fast_engine_knows(model, on_cpu)
         if engine == "fast" and not is_fast:
             raise NerfError(
                 "bad_config",
-                "The fast renderer knows Nerfacto with a hash grid, on the CPU, without normals; "
-                f"this is {type(model).__name__} on {self._device}.",
+                "The fast renderer knows Nerfacto with a hash grid of two features per entry, "
+                f"without normals; this is {type(model).__name__} on {self._device}.",
                 "Use engine auto.",
             )
         self.engine = "fast" if is_fast else "plain"
@@ -116,17 +125,21 @@ class Renderer:
         """
         width, height = (int(side) for side in cameras.size[index].tolist())
         source = cameras.select([index]).to(self._device)
+        side = self._config.block_px if self.engine == "fast" else 1
+        order = pixels_in_blocks(width, height, side).to(self._device)
 
         def rays_of(begin: int, end: int) -> Rays:
-            pixel = torch.arange(begin, end, device=self._device)
+            pixel = order[begin:end]
             columns, rows = pixel % width, pixel // width
             return source.generate_rays(
                 torch.zeros_like(pixel), torch.stack([columns, rows], dim=-1).float() + 0.5
             )
 
         flat = self._render(rays_of, width * height, appearance, progress)
+        place = np.empty(len(order), np.int64)
+        place[order.cpu().numpy()] = np.arange(len(order))
         shaped = {
-            item.name: getattr(flat, item.name).reshape(height, width, *_CHANNELS[item.name])
+            item.name: getattr(flat, item.name)[place].reshape(height, width, *_CHANNELS[item.name])
             for item in fields(flat)
             if getattr(flat, item.name) is not None
         }
@@ -184,10 +197,8 @@ class Renderer:
             result[name].clip(0.0, 1.0, out=result[name])
         return RenderedImage(**result)
 
-    def _drawer(
-        self, appearance: Appearance
-    ) -> tuple[int, Callable[[Rays], dict[str, FloatArray]]]:
-        """(rays per tile, a function from rays to the fields of `RenderedImage`, scene units)."""
+    def _drawer(self, appearance: Appearance) -> tuple[int, Drawer]:
+        """Rays per tile, and what draws them."""
         if self.engine == "plain":
 
             def draw_plain(rays: Rays) -> dict[str, FloatArray]:
@@ -198,21 +209,45 @@ class Renderer:
 
             return self._plain_tile(), draw_plain
 
-        # Imported here: a machine that only renders on a GPU never loads the compiler.
-        from pipelines.nerf.kernels.render_rays import pack_model, render_rays
-
-        packed = pack_model(
-            self._model,
-            appearance=appearance,
-            early_stop=self._early_stop,
-            weight_threshold=self._weight_threshold,
+        return (
+            self._gpu_drawer(appearance)
+            if self._device.type != "cpu"
+            else self._cpu_drawer(appearance)
         )
 
-        def draw_fast(rays: Rays) -> dict[str, FloatArray]:
+    def _cpu_drawer(self, appearance: Appearance) -> tuple[int, Drawer]:
+        # Imported here: a machine that only renders on a GPU never loads the compiler.
+        from pipelines.nerf.kernels.render_grid import BakedGrid
+        from pipelines.nerf.kernels.render_rays import pack_model, render_rays
+
+        if self._baked is None:
+            self._baked = BakedGrid()
+        packed = pack_model(
+            self._model, appearance=appearance, options=self._config, baked=self._baked
+        )
+
+        def draw(rays: Rays) -> dict[str, FloatArray]:
             found = render_rays(packed, rays.origins.numpy(), rays.directions.numpy())
             return dict(zip(_CHANNELS, found, strict=False))
 
-        return FAST_TILE_RAYS, draw_fast
+        return FAST_TILE_RAYS, draw
+
+    def _gpu_drawer(self, appearance: Appearance) -> tuple[int, Drawer]:
+        # Imported here: only this engine wants it.
+        from pipelines.nerf.gpu.render import TileDrawer
+
+        assert isinstance(self._model, Nerfacto)
+        drawer = TileDrawer(
+            self._model,
+            appearance=appearance,
+            early_stop=self._config.early_stop,
+            weight_threshold=self._config.weight_threshold,
+        )
+
+        def draw(rays: Rays) -> dict[str, FloatArray]:
+            return {name: seen.float().cpu().numpy() for name, seen in drawer.draw(rays).items()}
+
+        return drawer.tile_rays, draw
 
     def _plain_tile(self) -> int:
         """Rays whose intermediate tensors fit the memory that a plain chunk may take."""
@@ -220,8 +255,26 @@ class Renderer:
         return max(1, min(MAX_PLAIN_RAYS, budget // self._model.bytes_per_ray()))
 
 
-def _kernel_knows(model: Model) -> bool:
-    # Imported here: a machine that only renders on a GPU never loads the compiler.
-    from pipelines.nerf.kernels.render_rays import supports
+def pixels_in_blocks(width: int, height: int, side: int) -> Tensor:
+    """Every pixel's number, row by row [H * W] int64, in the order of blocks of side x side pixels.
 
-    return supports(model)
+    Rays through neighbouring pixels read the same parts of the tables.
+    """
+    padded_width, padded_height = (-(-size // side) * side for size in (width, height))
+    rows, columns = torch.arange(padded_height), torch.arange(padded_width)
+    number = torch.where(columns < width, rows[:, None] * width + columns, -1)
+    number[height:] = -1
+    blocks = number.reshape(padded_height // side, side, padded_width // side, side)
+    ordered = blocks.transpose(1, 2).reshape(-1)
+    return ordered[ordered >= 0]
+
+
+def _fast_engine_knows(model: Model, on_cpu: bool) -> bool:
+    # Imported here: a machine that only renders on a GPU never loads the compiler.
+    if on_cpu:
+        from pipelines.nerf.kernels.render_rays import supports
+
+        return supports(model)
+    from pipelines.nerf.gpu.render import can_draw
+
+    return can_draw(model)

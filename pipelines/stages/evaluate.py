@@ -36,7 +36,7 @@ from pipelines.nerf.floaters import floater_measures, opacity_of_density
 from pipelines.nerf.lpips import Lpips, lpips_if_configured
 from pipelines.nerf.metrics import psnr, ssim
 from pipelines.nerf.off_path import off_path_cameras
-from pipelines.nerf.renderer import RenderedImage, Renderer
+from pipelines.nerf.renderer import RenderedImage
 from pipelines.nerf.test_time import (
     FittedCodes,
     FittedPoses,
@@ -113,7 +113,7 @@ class _Meter:
 def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     """Measure. The summary is the content of `metrics.json`; without held-out images it is null."""
     config = evaluate_config(options)
-    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip")
+    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip", config.render)
     if next(scene.model.parameters()).device.type == "cpu":
         scene.model.set_engine("fast")  # fits and densities ask the model itself, no renderer
     (ctx.out / "images").mkdir(exist_ok=True)
@@ -327,7 +327,7 @@ def _floaters(
         return None, "Floaters were not measured: evaluate.floaters is off."
     posed = scene.training_images()
     lenses = [scene.lens_of(image) for image in posed]
-    renderer, model = Renderer(scene.model, scene.scene), scene.model
+    renderer, model = scene.renderer, scene.model
     num_calls, calls = _floater_renders(config), 0
 
     def render_rays(origins: Tensor, directions: Tensor) -> RenderedImage:

@@ -16,7 +16,7 @@ import numpy as np
 from pipelines.depth_views import Pinhole, ViewStore
 from pipelines.errors import ExportError
 from pipelines.glb import write_glb
-from pipelines.options import MeshOptions
+from pipelines.options import MeshOptions, render_config
 from pipelines.ply import write_mesh
 from pipelines.scene_bounds import SceneBounds
 from pipelines.stage import StageContext
@@ -28,7 +28,7 @@ _RENDER_SHARE, _FUSE_SHARE = 0.75, 0.95
 
 def run(options: MeshOptions, ctx: StageContext) -> dict[str, Any]:
     """Make the mesh. Raises ExportError `empty_mesh` where the model shows no surface."""
-    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip")
+    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip", render_config(options))
     ctx.progress(0.0, "looking for the scene's bounds")
     bounds = scene.bounds(options.max_distance, ctx.check_cancelled)
     if bounds is None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pipelines.depth_views import DepthView, Pinhole, ViewStore
 from pipelines.errors import ExportError
-from pipelines.options import PointcloudOptions
+from pipelines.options import PointcloudOptions, render_config
 from pipelines.ply import write_points
 from pipelines.scene_bounds import SceneBounds
 from pipelines.stage import StageContext
@@ -61,7 +61,7 @@ class Cloud:
 
 def run(options: PointcloudOptions, ctx: StageContext) -> dict[str, Any]:
     """Make the cloud. Raises ExportError `empty_pointcloud` where no surface is in the crop."""
-    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip")
+    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip", render_config(options))
     ctx.progress(0.0, "looking for the scene's bounds")
     probes = scene.probe_views(ctx.check_cancelled)
     bounds = scene.bounds(options.max_distance, ctx.check_cancelled, probes)

@@ -32,7 +32,8 @@ from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.renderer import Renderer
 from pipelines.nerf.training import TrainProgress, train
-from pipelines.options import StageOptions, train_config
+from pipelines.nerf.training_state import choose_device, is_fast
+from pipelines.options import StageOptions, resolve_options, stage_options, train_config
 from pipelines.stage import StageContext
 from pipelines.trained_scene import (
     as_uint8,
@@ -65,8 +66,9 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     """Train. Raises TrainingError: too_few_images, bad_image, non_finite_loss and the like."""
     use_all_cores()
     config = train_config(options)
-    ctx.progress(0.0, "loading images")
     with nerf_errors_as(TrainingError):
+        _compile_kernels(config, ctx)
+        ctx.progress(0.0, "loading images")
         inputs = _load(config, ctx)
         watcher = _Watcher(inputs, ctx)
         model = _train(inputs, config, ctx, watcher)
@@ -91,6 +93,36 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         "device": next(model.parameters()).device.type,
         "camera_deltas": deltas,
     }
+
+
+def preload() -> None:
+    """Load compiled kernels, so that the first run of this process need not: for idle moments."""
+    config = train_config(stage_options("train", resolve_options("preview", {})["train"]))
+    if _uses_kernels(config):
+        from pipelines.nerf.kernels.warm import load_compiled
+
+        load_compiled(config)
+
+
+def _compile_kernels(config: TrainConfig, ctx: StageContext) -> None:
+    """Wait for the kernels where this machine has not compiled them yet.
+
+    Before the first step, so that no estimate of the time left counts it.
+    """
+    if _uses_kernels(config):
+        # Imported here: a machine that trains on a GPU never loads the compiler.
+        from pipelines.nerf.kernels.warm import compile_kernels
+
+        def on_progress(done: int, known: int) -> None:
+            count = f" {done}/{known}" if known else ""
+            ctx.progress(0.0, f"compiling kernels{count}, only the first time")
+
+        compile_kernels(config, on_progress)
+
+
+def _uses_kernels(config: TrainConfig) -> bool:
+    device = choose_device(config.device)
+    return device.type == "cpu" and is_fast(config, device)
 
 
 def _load(config: TrainConfig, ctx: StageContext) -> _Inputs:

@@ -18,7 +18,7 @@ from PIL import Image
 from pipelines.camera_path import capture_order, nearest_pose_distance, smooth_path
 from pipelines.cameras_file import Intrinsics, PosedImage
 from pipelines.depth_views import Pinhole
-from pipelines.options import VideoOptions
+from pipelines.options import VideoOptions, render_config
 from pipelines.scene_bounds import camera_focus
 from pipelines.stage import StageContext
 from pipelines.trained_scene import TrainedScene
@@ -30,7 +30,7 @@ _PREVIEW_QUALITY = 93
 
 def run(options: VideoOptions, ctx: StageContext) -> dict[str, Any]:
     """Render the flight. Raises ToolError where ffmpeg fails."""
-    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip")
+    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip", render_config(options))
     images = scene.cameras.images
     lens = typical_lens([scene.lens_of(image) for image in images])
     video_lens = Pinhole.of(lens, options.long_side_px, multiple=2)

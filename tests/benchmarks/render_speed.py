@@ -4,10 +4,11 @@
         [--threads 2] [--rounds 3] [--vs plain] [--json out/render_speed.json]
     python -m tests.benchmarks.render_speed --model model.zip --capture CAPTURE [--long-side 480]
 
-Without a model an untrained one is rendered: fog, where early stops save nothing; a trained one is
-faster. With a model and its capture the held-out images are rendered twice, with all samples and
-with what the renderer may leave out, and the PSNR of both is stated: `parity --save-model` writes
-such a model.
+Without a model an untrained one is rendered: fog, where nothing can be left out; a trained one is
+faster. With a model and its capture the held-out images are rendered in turn with all samples, with
+each option of `RenderConfig` added to those before it, and as the job renders. Stated are the PSNR
+of all, that against the picture with all samples, and the share of pixels whose depth is more than
+5 % off from there. `parity --save-model` writes such a model.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ from pipelines.nerf.checkpoint import load_model
 from pipelines.nerf.config import DataConfig
 from pipelines.nerf.metrics import psnr
 from pipelines.nerf.models.nerfacto import Nerfacto
-from pipelines.nerf.renderer import Renderer
+from pipelines.nerf.render_config import ALL_SAMPLES, RenderConfig
+from pipelines.nerf.renderer import RenderedImage, Renderer
 from pipelines.nerf.training_state import choose_device
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import load_capture
@@ -42,17 +44,41 @@ NUM_TRAIN_IMAGES = 45
 
 @dataclass(frozen=True)
 class Speed:
-    """One way of rendering. seconds: of a picture, round by round. psnr: dB, where known."""
+    """One way of rendering. seconds, cpu_seconds: of a picture, round by round.
+
+    psnr, psnr_to_first: dB, against the truth and against the first way. depth_off: share of pixels
+    whose median depth is more than 5 % from that of the first way.
+    """
 
     label: str
     rays: int
     seconds: list[float]
+    cpu_seconds: list[float] = field(default_factory=list)
     psnr: float | None = None
+    psnr_to_first: float | None = None
+    depth_off: float | None = None
 
     @property
     def rays_per_s(self) -> float:
         """Rays a second in the median round."""
         return self.rays / statistics.median(self.seconds)
+
+
+class Stopwatch:
+    """Seconds by the clock, and those of all threads of this process."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+        self.cpu_seconds: list[float] = []
+
+    def measure(self, renderer: Renderer, cameras: Cameras, index: int) -> RenderedImage:
+        """Render a picture, and note what it took."""
+        started, cpu_started = time.perf_counter(), time.process_time()
+        seen = renderer.render(cameras, index)
+        wait_for_gpu()
+        self.seconds.append(time.perf_counter() - started)
+        self.cpu_seconds.append(time.process_time() - cpu_started)
+        return seen
 
 
 def one_camera(width: int, height: int) -> Cameras:
@@ -76,62 +102,89 @@ def alternate(ways: dict[str, Renderer], cameras: Cameras, rounds: int) -> list[
         renderer.render(small, 0)
         wait_for_gpu()
         print(f"{label}: first call {time.perf_counter() - started:.1f} s, not counted")
-    times: dict[str, list[float]] = {label: [] for label in ways}
+    watches = {label: Stopwatch() for label in ways}
     for _ in range(rounds):
         for label, renderer in ways.items():
-            started = time.perf_counter()
-            renderer.render(cameras, 0)
-            wait_for_gpu()
-            times[label].append(time.perf_counter() - started)
+            watches[label].measure(renderer, cameras, 0)
     rays = int(np.prod(cameras.size[0].tolist()))
-    return [Speed(label, rays, seconds) for label, seconds in times.items()]
+    return [
+        Speed(label, rays, watch.seconds, watch.cpu_seconds) for label, watch in watches.items()
+    ]
 
 
-def of_trained(model_file: Path, folder: Path, long_side: int, engine: str) -> list[Speed]:
-    """The held-out images with all samples, and with what the renderer may leave out."""
+def options_in_turn() -> dict[str, RenderConfig]:
+    """From all samples to the defaults, by adding one option after the other."""
+    default = RenderConfig()
+    config = replace(ALL_SAMPLES, block_px=1)
+    ways = {"all samples": config}
+    for name in ("block_px", "baked_cells", "skip_below", "early_stop", "color_weight"):
+        value = getattr(default, name)
+        config = replace(config, **{name: value})
+        ways[f"+ {name} {value:g}"] = config
+    return ways | {"as the job renders": default}
+
+
+def of_trained(
+    model_file: Path, folder: Path, long_side: int, engine: str, max_images: int
+) -> list[Speed]:
+    """The held-out images in all ways, alternating."""
     loaded = load_model(model_file)
     model = loaded.model.to(choose_device("auto"))
     capture = load_capture(folder, DataConfig(long_side_px=long_side))
     ways = {
-        "all samples": Renderer(
-            model, loaded.scene, engine=engine, early_stop=0.0, weight_threshold=0.0
-        ),
-        "as the job renders": Renderer(model, loaded.scene, engine=engine),
+        label: Renderer(model, loaded.scene, engine=engine, config=config)
+        for label, config in options_in_turn().items()
     }
     small = capture.cameras.resized(16)
     for renderer in ways.values():
         renderer.render(small, 0)
-    times: dict[str, list[float]] = {label: [] for label in ways}
-    values: dict[str, list[float]] = {label: [] for label in ways}
-    for index in capture.test:
+    watches = {label: Stopwatch() for label in ways}
+    values: dict[str, list[tuple[float, float, float]]] = {label: [] for label in ways}
+    for index in capture.test[: max_images or None]:
         truth = capture.images.image(index)
+        first: RenderedImage | None = None
         for label, renderer in ways.items():
-            started = time.perf_counter()
-            seen = renderer.render(capture.cameras, index)
-            wait_for_gpu()
-            times[label].append(time.perf_counter() - started)
-            values[label].append(psnr(torch.as_tensor(seen.rgb), truth))
+            seen = watches[label].measure(renderer, capture.cameras, index)
+            first = first or seen
+            values[label].append((psnr(torch.as_tensor(seen.rgb), truth), *difference(seen, first)))
     rays = int(np.prod(capture.images.sizes[0].tolist()))
-    return [Speed(label, rays, times[label], mean(values[label])) for label in ways]
+    means = {
+        label: [mean(column) for column in zip(*rows, strict=True)]
+        for label, rows in values.items()
+    }
+    return [
+        Speed(label, rays, watch.seconds, watch.cpu_seconds, *means[label])
+        for label, watch in watches.items()
+    ]
+
+
+def difference(one: RenderedImage, other: RenderedImage) -> tuple[float, float]:
+    """PSNR of one against the other, and the share of pixels whose depth is more than 5 % off."""
+    close = psnr(torch.as_tensor(one.rgb), torch.as_tensor(other.rgb))
+    return close, float((np.abs(one.depth - other.depth) > 0.05 * other.depth).mean())
 
 
 def print_report(speeds: Sequence[Speed]) -> None:
-    """The table, and the ratio of the first two ways."""
+    """The table; ratios of speeds are medians over rounds."""
     rows = [
         [
             speed.label,
             number(statistics.median(speed.seconds), 3),
             number(1.0 / statistics.median(speed.seconds), 2),
             number(speed.rays_per_s, 0),
+            number(1e6 * statistics.median(speed.cpu_seconds) / speed.rays, 1),
             number(speed.rays_per_s / reference.RENDER_RAYS_PER_S, 1),
+            number(ratio(speed, speeds[0]), 2),
             number(speed.psnr),
+            number(speed.psnr_to_first),
+            "" if speed.depth_off is None else f"{100.0 * speed.depth_off:.1f} %",
         ]
         for speed in speeds
     ]
-    header = ["", "s a picture", "pictures/s", "rays/s", "times the reference", "PSNR"]
+    header = ["", "s a picture", "pictures/s", "rays/s", "CPU us a ray"]
+    header += ["times the reference", "times the first"]
+    header += ["PSNR", "PSNR to the first", "depth off"]
     print("\n" + markdown_table(header, rows))
-    for other in speeds[1:]:
-        print(f"\n{speeds[0].label} / {other.label}: {ratio(speeds[0], other):.2f} times the speed")
 
 
 def ratio(one: Speed, other: Speed) -> float:
@@ -164,6 +217,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path)
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--long-side", type=int, default=reference.LONG_SIDE_PX)
+    parser.add_argument("--max-images", type=int, default=0, help="held-out images; 0 for all")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
@@ -173,7 +227,11 @@ def main() -> None:
     print(heading(machine))
     if arguments.model is not None:
         speeds = of_trained(
-            arguments.model, arguments.capture, arguments.long_side, arguments.engine
+            arguments.model,
+            arguments.capture,
+            arguments.long_side,
+            arguments.engine,
+            arguments.max_images,
         )
     else:
         speeds = untrained(arguments)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from pipelines.nerf.encodings import NUM_SPHERICAL_HARMONICS
 from pipelines.nerf.kernels.dense_layers import PackedLayer, apply_layer, pack_layer
-from pipelines.nerf.kernels.runtime import compiled
+from pipelines.nerf.kernels.runtime import compiled, merged
 
 
 class ColorNet(NamedTuple):
@@ -85,7 +85,7 @@ def direction_harmonics(direction, out, column):
     out[15, column] = -0.5900435899266435 * x * (xx - 3.0 * yy)
 
 
-@compiled
+@merged
 def color_logits(net, geometry, count, first, second, out):
     """out[:3, :count] = colours before the sigmoid.
 

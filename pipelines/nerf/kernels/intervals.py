@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 
+from pipelines.nerf.kernels.lanes import exp_all
 from pipelines.nerf.kernels.runtime import compiled
 
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -30,33 +31,41 @@ def spread_edges(s_edges, count, s_near, s_far, t_edges):
 
 
 @compiled
-def find_weights(density, t_edges, count, weights):
-    """Twin of `intervals.weights_from_density` for one ray; returns the sum of the weights."""
+def find_weights(density, t_edges, count, light, weights):
+    """Twin of `intervals.weights_from_density` for one ray; returns the sum of the weights.
+
+    light: [count + 1, rounded up to 16] scratch, the transmittance at the edges afterwards.
+    """
     passed, total = 0.0, 0.0
     for i in range(count):
-        thickness = density[i] * (t_edges[i + 1] - t_edges[i])
-        weight = np.float32(math.exp(-np.float32(passed))) * np.float32(-math.expm1(-thickness))
+        light[i] = -np.float32(passed)
+        passed += density[i] * (t_edges[i + 1] - t_edges[i])
+    light[count] = -np.float32(passed)
+    exp_all(light, count + 1, light)
+    for i in range(count):
+        weight = light[i] - light[i + 1]
         # An infinite density in an interval of no width is 0 * inf; it holds nothing.
         weights[i] = weight if weight == weight else ZERO
-        passed += thickness
         total += weights[i]
     return total
 
 
 @compiled
-def resample(s_edges, weights, total, count, num_new, padding, new_edges):
+def resample(s_edges, weights, total, count, num_new, padding, new_edges, masses):
     """new_edges[:num_new + 1]: twin of `intervals.sample_pdf` without jitter.
 
-    The draws increase, so one walk along the histogram finds all of them.
+    masses[:num_new]: the weight, without padding, that lies between the new edges. The draws
+    increase, so one walk along the histogram finds all of them.
     """
     scale = 1.0 / (total + count * padding)
     interval = 0
-    low = 0.0
+    low, before, reached = 0.0, 0.0, 0.0
     high = (weights[0] + padding) * scale
     num_edges = num_new + 1
     for j in range(num_edges):
         draw = (j + 0.5) / num_edges
         while interval < count - 1 and high <= draw:
+            before += weights[interval]
             interval += 1
             low = high
             high += (weights[interval] + padding) * scale
@@ -64,6 +73,37 @@ def resample(s_edges, weights, total, count, num_new, padding, new_edges):
         share = np.float32(min(max((draw - low) / (top - low), 0.0), 1.0)) if top > low else ZERO
         edge = s_edges[interval]
         new_edges[j] = edge + share * (s_edges[interval + 1] - edge)
+        here = before + share * weights[interval]
+        if j > 0:
+            masses[j - 1] = np.float32(here - reached)
+        reached = here
+
+
+@compiled
+def place_ray(origin, direction, t_edges, count, contraction, rows):
+    """rows[:3, i] = unit point midway in interval i; rows[3, i] = 1 where density may be, else 0.
+
+    rows: [4, count or more]. As `place`.
+    """
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    dx, dy, dz = direction[0], direction[1], direction[2]
+    for i in range(count):
+        t = HALF * (t_edges[i] + t_edges[i + 1])
+        x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+        inside = ONE
+        if contraction == NONE:
+            x, y, z = x * HALF + HALF, y * HALF + HALF, z * HALF + HALF
+            within = ZERO < x < ONE and ZERO < y < ONE and ZERO < z < ONE
+            inside = ONE if within else ZERO
+        else:
+            if contraction == L2:
+                size = np.float32(math.sqrt(x * x + y * y + z * z))
+            else:
+                size = max(abs(x), abs(y), abs(z))
+            inverse = ONE / max(size, ONE)
+            factor = (TWO - inverse) * inverse * QUARTER
+            x, y, z = x * factor + HALF, y * factor + HALF, z * factor + HALF
+        rows[0, i], rows[1, i], rows[2, i], rows[3, i] = x, y, z, inside
 
 
 @compiled

@@ -16,9 +16,8 @@ from torch import nn
 
 from pipelines.nerf.encodings import HashGrid
 from pipelines.nerf.kernels.dense_layers import PackedLayer, apply_layer, pack_layer
-from pipelines.nerf.kernels.hash_grid import encode_points
-from pipelines.nerf.kernels.hash_lanes import NUM_FEATURES, encode_columns
-from pipelines.nerf.kernels.runtime import compiled
+from pipelines.nerf.kernels.hash_lanes import encode_columns
+from pipelines.nerf.kernels.runtime import merged
 
 
 class DensityNet(NamedTuple):
@@ -55,22 +54,12 @@ def pack_density(grid: HashGrid, layers: nn.ModuleList) -> DensityNet:
     )
 
 
-@compiled
+@merged
 def density_logits(net, points, count, features, hidden, out):
     """Row 0 of out[O, TILE] becomes the logits at points[:count], the other rows the features.
 
-    points: [TILE, 3] in [0, 1]. features [L * F, TILE] and hidden [H, TILE], H at least 3, are
-    scratch.
+    points: [3, TILE] in [0, 1]. features [L * F, TILE] and hidden [H, TILE] are scratch.
     """
-    if net.table.shape[1] == NUM_FEATURES:
-        # Vector code wants a row per axis; the hidden units have not come yet.
-        for column in range(count):
-            for axis in range(3):
-                hidden[axis, column] = points[column, axis]
-        encode_columns(
-            hidden, 0, count, net.table, net.resolutions, net.dense, net.offsets, features
-        )
-    else:
-        encode_points(points, count, net.table, net.resolutions, net.dense, net.offsets, features.T)
+    encode_columns(points, 0, count, net.table, net.resolutions, net.dense, net.offsets, features)
     apply_layer(features, net.hidden, count, True, False, hidden)
     apply_layer(hidden, net.output, count, False, False, out)
