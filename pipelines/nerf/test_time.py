@@ -119,7 +119,8 @@ def fit_poses(
 
     cameras, images: of the same sizes, on the CPU. indices: rows of both that are fitted.
     progress: called after each step with the share done, in (0, 1]; what it raises ends the fit.
-    An image of which masks leave nothing keeps its pose, and its losses are None.
+    An image of which masks leave nothing keeps its pose, and its losses are None. One whose fit
+    ends with a larger loss keeps its pose too.
     Raises NerfError `non_finite_loss`.
     """
     schedule = _Schedule(
@@ -265,12 +266,16 @@ def _minimise(
     key: int,
     progress: Progress,
 ) -> tuple[float | None, float | None]:
-    """Adam on one parameter; the loss before and after. None without pixels."""
+    """Adam on one parameter; the loss before and after. None without pixels.
+
+    A fit that ends worse than it began is undone.
+    """
     if not len(pixels):
         progress(1.0)
         return None, None
     fixed = pixels.draw(MEASURED_RAYS, torch.Generator().manual_seed(key + 1))
     generator = torch.Generator().manual_seed(key)
+    given = parameter.detach().clone()
     optimizer = torch.optim.Adam([parameter], lr=schedule.lr)
     gamma = (schedule.lr_final / schedule.lr) ** (1.0 / schedule.steps)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, gamma)
@@ -290,6 +295,9 @@ def _minimise(
             f"The colour loss became {after} while fitting to a held-out image.",
             "Lower the rates in evaluate.test_time, or measure without fitting.",
         )
+    if after > before:
+        parameter.data.copy_(given)
+        return before, before
     return before, after
 
 

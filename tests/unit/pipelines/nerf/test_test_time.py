@@ -125,6 +125,13 @@ def test_poses_that_are_right_stay_where_they_are(toy: Toy) -> None:
     assert torch.equal(found.scene_from_camera[1:], toy.cameras.scene_from_camera[1:])
 
 
+def test_a_fit_that_ends_worse_than_it_began_is_undone(toy: Toy) -> None:
+    wild = replace(QUICK, pose_lr=0.5, pose_lr_final=0.5)
+    fitted = fit_poses(toy.model, toy.cameras, toy.rendered, [0], wild, seed=2)
+    assert torch.equal(fitted.tangent, torch.zeros(1, 6))
+    assert fitted.loss_after == fitted.loss_before
+
+
 @pytest.mark.parametrize("mode", ["so3xr3", "se3"])
 def test_moved_cameras_have_the_rays_that_the_optimiser_gives(mode: str) -> None:
     cameras = toy_cameras(4)

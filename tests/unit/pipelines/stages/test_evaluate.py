@@ -78,14 +78,18 @@ def test_fitted_poses_and_codes_are_what_is_rendered_and_measured(job: Workspace
     assert metrics["protocol"]["name"] == "nerfstudio"
     for row in metrics["per_image"]:
         fit, half = row["pose_fit"], row["half_unseen"]
-        assert 0.0 < fit["loss_after"] < fit["loss_before"]
-        assert fit["translation"] > 0.0
-        assert 0.0 < fit["rotation_deg"] < 15.0
+        assert 0.0 < fit["loss_after"] <= fit["loss_before"]
+        # A fit that ends worse is undone.
+        has_moved = fit["loss_after"] < fit["loss_before"]
+        assert (fit["translation"] > 0.0) == (fit["rotation_deg"] > 0.0) == has_moved
+        assert fit["rotation_deg"] < 15.0
         truth, shown = _shown(job, row["file"])
         assert peak_signal_noise_ratio(truth, shown) == pytest.approx(row["psnr"], abs=0.7)
         columns = {"left": slice(0, 18), "right": slice(18, 36)}[half["half"]]
         part = peak_signal_noise_ratio(truth[:, columns], shown[:, columns])
         assert part == pytest.approx(half["psnr"], abs=0.7)
+    fits = [row["pose_fit"] for row in metrics["per_image"]]
+    assert sum(fit["translation"] > 0.0 for fit in fits) > len(fits) / 2
     for name in ("psnr", "ssim"):
         halves = [row["half_unseen"][name] for row in metrics["per_image"]]
         assert metrics["half_unseen"][name] == pytest.approx(np.mean(halves), abs=1e-3)
