@@ -199,7 +199,9 @@ class DataConfig:
         le=4096.0,
     )
     images_on_gpu: bool = option(
-        False, "Hold the images on the GPU and draw pixels there; on a CPU it changes nothing."
+        True,
+        "Hold the images on the GPU, where they take at most half of its free memory, and draw "
+        "pixels there; on a CPU it changes nothing.",
     )
     scale_poses: bool = option(True, "Scale the scene so that cameras lie in [-1, 1]^3.")
 

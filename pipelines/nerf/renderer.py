@@ -69,7 +69,7 @@ class Renderer:
 
     model: is moved to `device` where one is given. scene: gives the world's unit.
     engine: "fast" is the compiled kernel on the CPU, `gpu.render` on a GPU; "plain" the model in
-        PyTorch; "auto" is fast on the CPU where the kernel knows the model, and plain elsewhere.
+        PyTorch; "auto" is fast where that knows the model and, on a GPU, agrees with it.
     config: what the fast engine may leave out; with `ALL_SAMPLES` it agrees with the plain one to
         rounding.
     normals: also render normals, which needs a model that learned them and the plain engine.
@@ -96,9 +96,9 @@ class Renderer:
                 "bad_config", f"There is no engine {engine}.", "Use auto, plain or fast."
             )
         on_cpu = self._device.type == "cpu"
-        # On a GPU the fast engine must be asked for, until it has been measured on one.
-        wanted = engine == "fast" or (engine == "auto" and on_cpu)
-        is_fast = wanted and not normals and _fast_engine_knows(model, on_cpu)
+        is_fast = engine != "plain" and not normals and _fast_engine_knows(model, on_cpu)
+        if engine == "auto" and is_fast and not on_cpu:
+            is_fast = _draws_right(model)
         if engine == "fast" and not is_fast:
             raise NerfError(
                 "bad_config",
@@ -278,3 +278,11 @@ def _fast_engine_knows(model: Model, on_cpu: bool) -> bool:
     from pipelines.nerf.gpu.render import can_draw
 
     return can_draw(model)
+
+
+def _draws_right(model: Model) -> bool:
+    # Imported here: a machine without a GPU needs no Triton.
+    from pipelines.nerf.gpu.self_check import picture_problem
+
+    assert isinstance(model, Nerfacto)
+    return picture_problem(model) is None

@@ -31,6 +31,7 @@ from pipelines.nerf.training_state import (
     initial_state,
     is_fast,
     learning_rates,
+    pixel_device,
 )
 
 TIMED_STEPS = 50
@@ -84,7 +85,8 @@ def train(
     _check_sizes(images, cameras, train_indices)
     device = choose_device(config.device)
     fingerprint = _fingerprint(config, seed, len(train_indices))
-    state = initial_state(config, len(train_indices), seed, device)
+    pixels_on = pixel_device(config, device, images.nbytes)
+    state = initial_state(config, len(train_indices), seed, device, pixels_on)
     if checkpoint_path is not None and checkpoint_path.exists():
         _resume(state, checkpoint_path, fingerprint)
     sampler = PixelSampler(images, train_indices, state.pixel_random.device)

@@ -18,6 +18,9 @@ from pipelines.nerf.config import OptimizerConfig, TrainConfig, find_method
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
 
+IMAGE_SHARE = 0.5
+"""Of a GPU's free memory, for the images."""
+
 MakeAdam = Callable[..., torch.optim.Adam]
 """Called with parameters, `lr` and `eps`."""
 
@@ -115,10 +118,25 @@ def _plain_adam(parameters: Iterable[nn.Parameter], lr: float, eps: float) -> to
     return torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
 
 
+def pixel_device(config: TrainConfig, device: torch.device, image_bytes: int) -> torch.device:
+    """Where the images lie and pixels are drawn: on the GPU where they leave it enough memory."""
+    if device.type != "cuda" or not config.data.images_on_gpu:
+        return torch.device("cpu")
+    free, _ = torch.cuda.mem_get_info(device)
+    return device if image_bytes <= IMAGE_SHARE * free else torch.device("cpu")
+
+
 def initial_state(
-    config: TrainConfig, num_images: int, seed: int, device: torch.device
+    config: TrainConfig,
+    num_images: int,
+    seed: int,
+    device: torch.device,
+    pixels_on: torch.device | None = None,
 ) -> TrainingState:
-    """The state before the first step; the seed decides it."""
+    """The state before the first step; the seed decides it.
+
+    pixels_on: as `pixel_device` says; None for the CPU.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model: Model = find_method(config.method).build(config.model, num_images).to(device)
@@ -155,8 +173,6 @@ def initial_state(
         model=model,
         optimizers=optimizers,
         scaler=scaler,
-        pixel_random=torch.Generator(device if config.data.images_on_gpu else "cpu").manual_seed(
-            seed
-        ),
+        pixel_random=torch.Generator(pixels_on or "cpu").manual_seed(seed),
         model_random=torch.Generator(device).manual_seed(seed + 1),
     )

@@ -29,6 +29,7 @@ from pipelines.nerf.encodings import HashGrid, hash_encode
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.gpu.step import EAGER_STEPS, TrainingStep, capturable_adam, loss_scaler
 from pipelines.nerf.models.base import Model
+from pipelines.nerf.models.nerfacto import Nerfacto
 
 LOG = logging.getLogger(__name__)
 
@@ -49,6 +50,8 @@ GRID_POINTS = 20_000
 VALUES, HALF_VALUES, SLOPES = 1e-3, 5e-3, 3e-2
 """Allowed gaps of a grid: of float32, where the place inside a cell of 2,048 keeps 13 bits; of
 float16; of gradients to points, which jump where rounding puts a point into the next cell."""
+COLOR_TOLERANCE = 0.01
+"""Of colours in [0, 1], in the mean: some units of eight bits; float16 tables bring about less."""
 END_TOLERANCE = 0.2
 """Of the last losses: Adam turns the rounding of small gradients into whole steps."""
 
@@ -74,6 +77,41 @@ def engine_problem(config: TrainConfig, device: torch.device) -> str | None:
     if problem is not None:
         LOG.warning("The GPU engine is not used on %s: %s", device, problem)
     return problem
+
+
+def picture_problem(model: Nerfacto) -> str | None:
+    """Why `gpu.render` must not draw this model where it lies; None where it may.
+
+    Compares the colours of a few hundred rays with the model's own. As `engine_problem`, but asked
+    anew for every model.
+    """
+    try:
+        problem = _wrong_picture(model)
+    except engine_errors() as error:
+        problem = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    if problem is not None:
+        LOG.warning("The GPU renderer is not used: %s", problem)
+    return problem
+
+
+@torch.no_grad()
+def _wrong_picture(model: Nerfacto) -> str | None:
+    # Imported here: only who draws pictures needs it.
+    from pipelines.nerf.gpu.render import TileDrawer
+
+    device = next(model.parameters()).device
+    pixel = torch.arange(NUM_RAYS, device=device)
+    places = torch.stack([pixel % IMAGE_SIDE, pixel // IMAGE_SIDE], dim=-1) * 3.0 % IMAGE_SIDE
+    rays = _cameras().to(device).generate_rays(pixel % NUM_IMAGES, places + 0.5)
+    was_training = model.training
+    model.eval()
+    try:
+        expected = model(rays)["rgb"].float()
+        found = TileDrawer(model, early_stop=0.0, weight_threshold=0.0).draw(rays)["rgb"].float()
+    finally:
+        model.train(was_training)
+    gap = float((found - expected).abs().mean())
+    return None if gap <= COLOR_TOLERANCE else f"its colours are off by {gap:.3f} in the mean"
 
 
 def engine_errors() -> tuple[type[Exception], ...]:

@@ -11,8 +11,10 @@ from torch import Tensor
 
 from pipelines.nerf.config import TrainConfig
 from pipelines.nerf.gpu import self_check
-from pipelines.nerf.gpu.self_check import engine_problem, relative_gap
+from pipelines.nerf.gpu.render import TileDrawer
+from pipelines.nerf.gpu.self_check import engine_problem, picture_problem, relative_gap
 from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.rays import Rays
 from tests.unit.pipelines.nerf.toy_scene import tiny_config
 
 CPU = torch.device("cpu")
@@ -91,3 +93,35 @@ def test_gaps_are_relative_to_what_is_expected() -> None:
     assert relative_gap(torch.zeros(2), torch.zeros(2)) == 0.0
     assert relative_gap(torch.ones(2), torch.zeros(2)) == float("inf")
     assert not relative_gap(torch.tensor([float("nan")]), torch.ones(1)) <= 1.0
+
+
+def test_a_model_that_is_drawn_as_it_sees_itself_is_no_problem() -> None:
+    model = Nerfacto(tiny_config().model, 4)  # type: ignore[arg-type]
+    model.train()
+    assert picture_problem(model) is None
+    assert model.training
+
+
+@pytest.mark.parametrize("value", [5.0, float("nan")])
+def test_wrong_colours_of_the_gpu_renderer_are_named(
+    monkeypatch: pytest.MonkeyPatch, value: float
+) -> None:
+    model = Nerfacto(tiny_config().model, 4)  # type: ignore[arg-type]
+    ours = TileDrawer.draw
+
+    def spoiled(drawer: TileDrawer, rays: Rays) -> dict[str, Tensor]:
+        return {name: seen + value for name, seen in ours(drawer, rays).items()}
+
+    monkeypatch.setattr(TileDrawer, "draw", spoiled)
+    assert "colours" in str(picture_problem(model))
+
+
+def test_a_renderer_that_cannot_run_is_a_problem_and_no_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(drawer: TileDrawer, rays: Rays) -> dict[str, Tensor]:
+        raise RuntimeError("no C compiler")
+
+    monkeypatch.setattr(TileDrawer, "draw", fails)
+    model = Nerfacto(tiny_config().model, 4)  # type: ignore[arg-type]
+    assert picture_problem(model) == "RuntimeError: no C compiler"
