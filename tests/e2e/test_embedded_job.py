@@ -22,7 +22,6 @@ pytestmark = [pytest.mark.services, pytest.mark.slow]
 
 BRIEF = {
     "frames": {"num_frames": 32},
-    "train": {"max_steps": 150, "optimizer": {"decay_steps": 150}},
     "pointcloud": {"num_points": 5000},
     "mesh": {"resolution": 64, "num_views": 12, "render_long_side_px": 96},
     "video": {"num_frames": 8, "long_side_px": 96},
