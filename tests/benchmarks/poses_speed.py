@@ -208,6 +208,9 @@ def main() -> None:
     unknown = sorted(set(ways) - set(WAYS))
     if unknown:
         parser.error(f"unknown ways: {', '.join(unknown)}; there are {', '.join(WAYS)}")
+    for wanted in arguments.captures:
+        if wanted != SAMPLE and not Path(wanted).is_file():
+            parser.error(f"{wanted} is not a file: name a video or an archive, or {SAMPLE}")
     machine = describe(arguments.threads if arguments.threads > 0 else None)
     print(heading(machine))
     measured: list[Measured] = []
