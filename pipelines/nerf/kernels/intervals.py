@@ -1,4 +1,4 @@
-"""Numba twins, one ray at a time, of `intervals`, `samplers` and `contraction`, for rendering.
+"""Numba twins, one ray at a time, of `intervals`, `samplers` and `contraction`.
 
 Symbols: S intervals with S + 1 edges; `t` scene distance along a unit ray; `s` the same in [0, 1].
 Sums run in float64 and are rounded once per element, as torch does it on the CPU.
@@ -80,10 +80,10 @@ def resample(s_edges, weights, total, count, num_new, padding, new_edges, masses
 
 
 @compiled
-def place_ray(origin, direction, t_edges, count, contraction, rows):
-    """rows[:3, i] = unit point midway in interval i; rows[3, i] = 1 where density may be, else 0.
+def place_ray(origin, direction, t_edges, count, contraction, first, rows):
+    """rows[:3, first + i] = unit point midway in interval i; rows[3, .] = 1 where density may be.
 
-    rows: [4, count or more]. As `place`.
+    rows: [4 or more, first + count or more]; 0 in row 3 elsewhere. As `place`.
     """
     ox, oy, oz = origin[0], origin[1], origin[2]
     dx, dy, dz = direction[0], direction[1], direction[2]
@@ -103,7 +103,8 @@ def place_ray(origin, direction, t_edges, count, contraction, rows):
             inverse = ONE / max(size, ONE)
             factor = (TWO - inverse) * inverse * QUARTER
             x, y, z = x * factor + HALF, y * factor + HALF, z * factor + HALF
-        rows[0, i], rows[1, i], rows[2, i], rows[3, i] = x, y, z, inside
+        column = first + i
+        rows[0, column], rows[1, column], rows[2, column], rows[3, column] = x, y, z, inside
 
 
 @compiled

@@ -19,12 +19,11 @@ import numpy as np
 from pipelines.nerf.fields import GRADIENT_CLAMP
 from pipelines.nerf.kernels.dense_layers import TILE, PackedLayer, add_products, apply_layer
 from pipelines.nerf.kernels.hash_lanes import PLACE_ROWS, encode_columns, scatter_columns
-from pipelines.nerf.kernels.intervals import L2, NONE
+from pipelines.nerf.kernels.intervals import place_ray
 from pipelines.nerf.kernels.lanes import exp_all, expm1_all
 from pipelines.nerf.kernels.runtime import compiled, merged
 
-HALF, ONE, TWO, ZERO = np.float32(0.5), np.float32(1.0), np.float32(2.0), np.float32(0.0)
-QUARTER = np.float32(0.25)
+ONE, ZERO = np.float32(1.0), np.float32(0.0)
 LEAST_SLOPE, MOST_SLOPE = (np.float32(math.exp(s * GRADIENT_CLAMP)) for s in (-1.0, 1.0))
 
 
@@ -69,7 +68,7 @@ class Scratch(NamedTuple):
     places: Any  # [PLACE_ROWS, TILE]
 
 
-INSIDE, WIDTH = 3, 4  # 1 where density may be, else 0; length of the interval
+INSIDE, WIDTH = 3, 4  # 1 where density may be, else 0 (`place_ray`); length of the interval
 GROWTH, THICKNESS, PASSED, STOPPED = 5, 6, 7, 8  # exp(logit), -x, T, exp(-x) - 1
 WORK, SLOPE = 9, 10  # log T, then exp(-x); dL / dlogit
 NUM_COLUMN_ROWS = 11
@@ -94,48 +93,17 @@ def _make_scratch(net, num_samples, rays_per_block):
 
 
 @merged
-def _place_ray(origin, direction, edges, count, first, contraction, columns):
-    """Unit points and widths of the samples of a ray into columns from `first` on."""
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    dx, dy, dz = direction[0], direction[1], direction[2]
-    for i in range(count):
-        low, high = edges[i], edges[i + 1]
-        t = HALF * (low + high)
-        x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-        inside = ONE
-        if contraction == NONE:
-            x, y, z = x * HALF + HALF, y * HALF + HALF, z * HALF + HALF
-            within = ZERO < x < ONE and ZERO < y < ONE and ZERO < z < ONE
-            inside = ONE if within else ZERO
-        else:
-            if contraction == L2:
-                size = np.float32(math.sqrt(x * x + y * y + z * z))
-            else:
-                size = max(abs(x), abs(y), abs(z))
-            inverse = ONE / max(size, ONE)
-            factor = (TWO - inverse) * inverse * QUARTER
-            x, y, z = x * factor + HALF, y * factor + HALF, z * factor + HALF
-        column = first + i
-        columns[0, column], columns[1, column], columns[2, column] = x, y, z
-        columns[INSIDE, column] = inside
-        columns[WIDTH, column] = high - low
-
-
-@merged
 def _place_block(origins, directions, t_edges, rays, num_rays, net, columns):
-    """`_place_ray` for the first of `rays`, one behind the other."""
+    """Unit points and widths of the samples of the first of `rays`, one ray behind the other."""
     num_samples = t_edges.shape[1] - 1
     for k in range(num_rays):
-        ray = rays[k]
-        _place_ray(
-            origins[ray],
-            directions[ray],
-            t_edges[ray],
-            num_samples,
-            k * num_samples,
-            net.contraction,
-            columns,
+        ray, first = rays[k], k * num_samples
+        edges = t_edges[ray]
+        place_ray(
+            origins[ray], directions[ray], edges, num_samples, net.contraction, first, columns
         )
+        for i in range(num_samples):
+            columns[WIDTH, first + i] = edges[i + 1] - edges[i]
 
 
 @merged

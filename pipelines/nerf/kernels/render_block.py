@@ -289,6 +289,7 @@ def _place_block(settings, scratch, origins, directions, count):
             scratch.t_edges[ray],
             count,
             settings.contraction,
+            0,
             scratch.points[ray],
         )
 
