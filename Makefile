@@ -8,10 +8,11 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 HOST ?= 127.0.0.1
 PORT ?= 8000
 CAPTURE ?=
+MINUTES ?= 5
 export CAPTURE HOST PORT
 
 .DEFAULT_GOAL := help
-.PHONY: help demo up test check fix install install-test lock clean
+.PHONY: help demo up test check fix mutants install install-test lock clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
@@ -34,6 +35,10 @@ check: install-test ## Lint, types and import rules
 fix: install-test ## Format and mend what can be mended
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
+
+mutants: install-test ## Plant faults, count those tests notice: 40 minutes at most, or [MINUTES=5] a group
+	@$(PIP) install --quiet --editable '.[mutants]'
+	@$(BIN)/python -m tests.mutants --minutes $(MINUTES)
 
 install: $(VENV)/.installed ## Install the service into .venv
 

@@ -22,7 +22,7 @@ from api.problems import Problem
 from api.settings import ApiSettings
 from storage.api_keys import ensure_api_key
 from storage.db import Database
-from storage.objects import open_object_store
+from storage.open_objects import open_object_store
 from storage.queue import Bell
 from storage.schema import upgrade
 

@@ -187,7 +187,28 @@ def print_job(job: Job, console: Console) -> None:
     console.print(table)
     if job.queue_position is not None:
         console.print(f"place {job.queue_position} in the queue")
+    if job.metrics is not None or job.assets is not None:
+        quality = Table("quality", "", box=None)
+        psnr = (job.metrics or {}).get("psnr")
+        for what, value in [
+            ("held-out PSNR", _number(psnr, ".2f", " dB")),
+            *asset_rows(job.assets),
+        ]:
+            quality.add_row(what, value)
+        console.print(quality)
+    print_warnings((job.assets or {}).get("warnings", []), console)
     print_error(job, console)
+
+
+def print_warnings(warnings: Iterable[dict[str, Any]], console: Console) -> None:
+    """What a job that ended well should still be looked at for, and what to do about it."""
+    for warning in warnings:
+        console.print(
+            f"[yellow]Warning[/yellow] ({clean(str(warning.get('code', '')))})\n"
+            f"{clean(str(warning.get('message', '')))}\n{clean(str(warning.get('hint', '')))}",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def print_error(job: Job, console: Console) -> None:
@@ -223,6 +244,17 @@ def _number(value: Any, form: str, unit: str = "") -> str:
     return "not measured" if value is None else f"{value:{form}}{unit}"
 
 
+def asset_rows(assets: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """(what, value) of the mesh against held-out photos; nothing where that was not measured."""
+    mesh = (assets or {}).get("mesh")
+    if not mesh:
+        return []
+    return [
+        ("mesh covers", _number(mesh.get("coverage"), ".0%", " of held-out views")),
+        ("mesh PSNR", _number(mesh.get("psnr"), ".2f", " dB where it covers")),
+    ]
+
+
 def quality_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     """(what, value) from a report: images registered, held-out quality, time per stage."""
     poses, metrics = report.get("poses", {}), report.get("metrics", {})
@@ -239,6 +271,7 @@ def quality_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows[-1] = (rows[-1][0], f"{held}, {metrics['width']} x {metrics['height']} px")
     rows.append(("held-out PSNR", _number(metrics.get("psnr"), ".2f", " dB")))
     rows.append(("held-out SSIM", _number(metrics.get("ssim"), ".3f")))
+    rows += asset_rows(report.get("assets"))
     timings = report.get("timings", {})
     rows += [
         (f"time {name.removesuffix('_s')}", duration(seconds))
@@ -271,3 +304,4 @@ def print_results(
         quality.add_row(what, value)
     console.print(artifacts)
     console.print(quality)
+    print_warnings(report.get("warnings", []), console)

@@ -82,6 +82,7 @@ class Job(_Model):
     capture_id: str
     stages: list[Stage]
     metrics: dict[str, float | int | None] | None
+    assets: dict[str, Any] | None = None
     error: JobError | None
     created_at: datetime
     started_at: datetime | None

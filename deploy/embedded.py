@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.supervisor import Program, StartFailed, Supervisor
+from storage.new_keys import new_api_key
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -97,7 +98,7 @@ class Secrets:
             made = cls(
                 signing_key=secrets.token_hex(32),
                 redis_password=secrets.token_hex(32),
-                api_key=f"nwk_{secrets.token_urlsafe(32)}",
+                api_key=new_api_key(),
             )
             write_private(path, json.dumps(made.__dict__, indent=1))
         return cls(**json.loads(path.read_text("utf-8")))

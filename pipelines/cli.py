@@ -10,11 +10,12 @@ Exit codes: 0 done, 1 a stage failed, 2 the command was wrong, 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import logging
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -30,6 +31,7 @@ from pipelines.manifest import (
 from pipelines.options import PRESETS, OptionsError, parse_assignments, resolve_options
 from pipelines.registry import STAGE_NAMES, get_stage
 from pipelines.stage import Stage
+from pipelines.stages.report import write_failed_report_locally
 from pipelines.workspace import Workspace
 
 ALL = "all"
@@ -123,8 +125,22 @@ def _run_one(name: str, workspace: Workspace, options: dict[str, object], kind: 
     stage = get_stage(name)
     seed = json.loads(workspace.job_file.read_text("utf-8"))["seed"]
     hooks = RunHooks(on_progress=ProgressLine(stage, sys.stderr))
-    manifest = run_stage(stage, options, workspace, seed=seed, hooks=hooks)
+    with _reported(workspace, lambda: name):
+        manifest = run_stage(stage, options, workspace, seed=seed, hooks=hooks)
     _show(name, manifest)
+
+
+@contextlib.contextmanager
+def _reported(workspace: Workspace, stage: Callable[[], str | None]) -> Iterator[None]:
+    """Write the report of a job whose stage fails. stage: the one that runs, None before any."""
+    try:
+        yield
+    except PipelineError as error:
+        name = stage()
+        if name is not None:
+            path = write_failed_report_locally(workspace, name, error.as_dict())
+            print(f"\nwhat is known of it: {path}", file=sys.stderr)
+        raise
 
 
 def _show(name: str, manifest: dict[str, object]) -> None:
@@ -141,16 +157,23 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.stage != ALL:
         _run_one(arguments.stage, workspace, options[arguments.stage], kind)
         return 0
-    manifests = run_job_locally(
-        workspace,
-        arguments.preset,
-        overrides,
-        kind=kind,
-        seed=int(str(job["seed"])),
-        hooks_for=lambda stage: RunHooks(on_progress=ProgressLine(stage, sys.stderr)),
-        on_reused=lambda stage: print(f"{stage.name:<10} is current", file=sys.stderr),
-        until=arguments.until,
-    )
+    started: list[str] = []
+
+    def hooks_for(stage: Stage) -> RunHooks:
+        started.append(stage.name)
+        return RunHooks(on_progress=ProgressLine(stage, sys.stderr))
+
+    with _reported(workspace, lambda: started[-1] if started else None):
+        manifests = run_job_locally(
+            workspace,
+            arguments.preset,
+            overrides,
+            kind=kind,
+            seed=int(str(job["seed"])),
+            hooks_for=hooks_for,
+            on_reused=lambda stage: print(f"{stage.name:<10} is current", file=sys.stderr),
+            until=arguments.until,
+        )
     for name, manifest in manifests.items():
         _show(name, manifest)
     return 0

@@ -56,8 +56,8 @@ class CaptureError(PipelineError):
 
     Codes in use: empty_file, unknown_type, too_large, archive_unsafe, archive_bomb,
     archive_damaged, archive_encrypted, no_images, video_truncated, video_undecodable,
-    no_video_stream, video_too_long, image_undecodable, too_few_images, poses_missing,
-    poses_malformed, capture_missing.
+    no_video_stream, video_too_long, projection_unsupported, image_undecodable, too_few_images,
+    poses_missing, poses_malformed, capture_missing.
     """
 
     code = "capture_unusable"
@@ -75,13 +75,15 @@ class PosesError(PipelineError):
 
 
 class TrainingError(PipelineError):
-    """Training cannot go on. Codes in use: non_finite_loss, too_few_images, out_of_memory."""
+    """Training cannot go on. Codes in use: non_finite_loss, too_few_images, out_of_memory,
+    depth_maps_outdated."""
 
     code = "training_failed"
 
 
 class ExportError(PipelineError):
-    """The trained model gives no asset. Codes in use: empty_mesh, empty_pointcloud."""
+    """The trained model gives no asset. Codes in use: empty_mesh, empty_pointcloud,
+    geometry_poor, no_focus."""
 
     code = "export_failed"
 

@@ -26,10 +26,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipelines.errors import PipelineError, ResourceError
+from pipelines.errors import Cancelled, PipelineError, ResourceError
 from pipelines.options import resolve_options, stage_options
 from pipelines.registry import STAGES, get_stage, load_function, skipped_stages
-from pipelines.stage import ProgressSink, Stage, StageContext
+from pipelines.stage import REPORT, ProgressSink, Stage, StageContext
 from pipelines.workspace import MANIFEST, Workspace
 
 FORMAT_VERSION = 1
@@ -180,8 +180,9 @@ def run_stage(
     which `load_s` went into hashing inputs and importing the stage's code, and `compile_s` into
     compiling kernels. A worker adds what lies around (`worker.runner`).
     Raises what the stage raises; a full disk and a lack of memory become
-    ResourceError (disk_full, out_of_memory). What a failed stage wrote is removed, its checkpoint
-    stays; a stage that succeeds has no checkpoint any more.
+    ResourceError (disk_full, out_of_memory). What a failed stage wrote is removed, but for its
+    report.json, which `workspace.failed(name)` keeps; its checkpoint stays, too. A stage that
+    succeeds has no checkpoint any more.
     """
     hooks = hooks or RunHooks()
     options = stage_options(stage.name, dict(options_values))
@@ -189,6 +190,7 @@ def run_stage(
     checkpoint = workspace.checkpoint(stage.name)
     with _translated(stage):
         _remove(out)
+        _remove(workspace.failed(stage.name))
         out.mkdir(parents=True)
         checkpoint.mkdir(parents=True, exist_ok=True)
     context = StageContext(
@@ -218,7 +220,9 @@ def run_stage(
                 out, stage, options.model_dump(mode="json"), summary, timings, inputs, seed=seed
             )
             _publish(out, workspace.stage(stage.name))
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, PipelineError) and not isinstance(error, Cancelled):
+            _keep_report(out, workspace.failed(stage.name))
         shutil.rmtree(out, ignore_errors=True)
         raise
     shutil.rmtree(checkpoint, ignore_errors=True)
@@ -227,8 +231,16 @@ def run_stage(
 
 def _compile_seconds() -> float:
     """Seconds that this process spent on compiling kernels, without loading the compiler for it."""
-    runtime = sys.modules.get("pipelines.nerf.kernels.runtime")
+    runtime = sys.modules.get("pipelines.nerf.engines.cpu.parts.runtime")
     return 0.0 if runtime is None else float(runtime.compile_seconds())
+
+
+def _keep_report(out: Path, target: Path) -> None:
+    """Move what a failed stage said of itself out of its folder, if it said anything."""
+    if (out / REPORT).is_file():
+        with contextlib.suppress(OSError):  # a full disk must not hide why the stage failed
+            target.mkdir(parents=True, exist_ok=True)
+            os.replace(out / REPORT, target / REPORT)
 
 
 def _remove(folder: Path) -> None:

@@ -1,50 +1,41 @@
 """The options of every stage, and the presets: what `GET /v1/options` and `--set` speak of.
 
-Each default lives once: here, or for the NeRF in `pipelines.nerf.config`, whose dataclasses are
-turned into pydantic models by `_model_of`. Unknown keys and values out of range are refused. No
-torch is imported.
+Each default lives once: here, for the exports in `pipelines.exports.kinds`, or for the NeRF in
+`pipelines.nerf.options`, whose dataclasses `pipelines.option_models` turns into pydantic models.
+Unknown keys and values out of range are refused. No torch is imported.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import types
-import typing
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import Field, ValidationError
 
-from pipelines.nerf.config import (
-    NERFACTO,
-    TrainConfig,
-    allowed_names,
-    config_from_dict,
-    default_train_config,
-    find_method,
-    methods,
-    validate,
-)
+from pipelines.captures.minimum import MIN_IMAGES, MIN_POSED_IMAGES
+from pipelines.exports.catalogue import EXPORTS
+from pipelines.exports.options import ExtentOptions
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.evaluation_config import EvaluateConfig
-from pipelines.nerf.plugins import Method
-from pipelines.nerf.render_config import RenderConfig
+from pipelines.nerf.options.catalogue import find_method, methods
+from pipelines.nerf.options.evaluate import EvaluateConfig
+from pipelines.nerf.options.methods.nerfacto import NERFACTO
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.options.train import SplitConfig, TrainConfig, config_from_dict, validate
+from pipelines.option_models import StageOptions, model_of
 from pipelines.registry import STAGE_NAMES
-
-
-class StageOptions(BaseModel):
-    """Common ground: unknown keys are refused, values are checked, instances are frozen."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
 class IngestOptions(StageOptions):
     """Limits on what is accepted."""
 
     max_duration_s: float = Field(1800.0, gt=0, le=86400, description="Longest video, in seconds.")
-    max_images: int = Field(5000, ge=3, le=100_000, description="Most images in an archive.")
+    max_images: int = Field(
+        5000, ge=MIN_IMAGES, le=100_000, description="Most images in an archive."
+    )
     max_posed_images: int = Field(
         600,
-        ge=3,
+        ge=MIN_POSED_IMAGES,
         le=100_000,
         description="Images used of a Polycam or Record3D export, evenly picked.",
     )
@@ -92,14 +83,22 @@ class PosesOptions(StageOptions):
     retrieval_neighbours: int = Field(
         20, ge=1, le=200, description="Photos most alike that each photo is matched with."
     )
-    camera_model: Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"] = Field(
-        "OPENCV", description="Lens model that is fitted."
+    camera_model: Literal[
+        "auto", "SIMPLE_RADIAL", "RADIAL", "PINHOLE", "OPENCV", "OPENCV_FISHEYE"
+    ] = Field(
+        "auto",
+        description="Lens model that is fitted. auto starts with SIMPLE_RADIAL (square pixels, one "
+        "radial term) and goes to RADIAL or OPENCV where that lowers the error of observations "
+        "that were set aside; OPENCV_FISHEYE must be asked for.",
     )
     min_registered_ratio: float = Field(
         0.3, ge=0, le=1, description="Below this share of registered images the job fails."
     )
     min_registered: int = Field(
-        8, ge=3, le=1000, description="Below this number of registered images the job fails."
+        MIN_IMAGES,
+        ge=3,
+        le=1000,
+        description="Below this number of registered images the job fails.",
     )
     retry_below_ratio: float = Field(
         0.8,
@@ -124,143 +123,68 @@ class PosesOptions(StageOptions):
     )
 
 
-class RenderingOptions(StageOptions):
-    """Common to the stages that render."""
+class DepthOptions(model_of(StereoConfig)):  # type: ignore[misc]
+    """Depth maps before training."""
 
-    render: RenderOptions = Field(
-        default_factory=lambda: RenderOptions(), description="What rendering leaves out."
+    source: Literal["stereo", "off"] = Field(
+        "stereo",
+        description="stereo compares each picture with its neighbours; off leaves training without "
+        "depth maps.",
+    )
+    held_out: model_of(SplitConfig) = Field(  # type: ignore[valid-type]
+        default_factory=lambda: dataclasses.asdict(SplitConfig()),
+        description="Which images take no part: always as in train.data, which is the place to "
+        "change it.",
     )
 
 
-class CropOptions(RenderingOptions):
-    """What part of the scene is exported, common to mesh and point cloud."""
-
-    max_distance: float = Field(
-        2.0,
-        gt=0,
-        le=1000,
-        description="Farthest surface kept from the cameras' focus, in units of the cameras' "
-        "mean distance to it.",
-    )
-
-
-class PointcloudOptions(CropOptions):
-    """The point cloud."""
-
-    num_points: int = Field(1_000_000, ge=1000, le=50_000_000, description="Points wanted.")
-    remove_outliers: bool = Field(True, description="Drop points far from their neighbours.")
-
-
-class MeshOptions(CropOptions):
-    """The mesh, by fusing rendered depth (TSDF)."""
+class DraftOptions(ExtentOptions):
+    """The mesh from depth maps alone, before training."""
 
     resolution: int = Field(
-        256, ge=32, le=2048, description="Voxels along the longest side of the fused volume."
+        160, ge=32, le=2048, description="Voxels along the longest side of the subject."
     )
     num_views: int = Field(
-        0, ge=0, le=5000, description="Training views fused, evenly picked; 0 for all."
-    )
-    render_long_side_px: int = Field(
-        640, ge=64, le=4096, description="Long side of the rendered depth, in pixels."
+        64, ge=0, le=5000, description="Depth maps fused, evenly picked; 0 for all."
     )
     max_faces: int = Field(
-        200_000, ge=100, le=20_000_000, description="The mesh is simplified to this."
+        100_000, ge=100, le=20_000_000, description="Simplified to this, as mesh.max_faces."
     )
 
 
-class VideoOptions(RenderingOptions):
-    """The video along the captured path."""
+class AssessOptions(StageOptions):
+    """The delivered mesh and cloud against the photos, and whether the surfaces hold together."""
 
-    num_frames: int = Field(240, ge=8, le=20_000, description="Frames rendered.")
-    fps: float = Field(24.0, ge=1, le=120, description="Frames per second.")
+    num_views: int = Field(
+        8, ge=0, le=5000, description="Held-out photos compared, evenly picked; 0 for all."
+    )
     long_side_px: int = Field(
-        1280, ge=64, le=8192, description="Long side of the video, in pixels."
+        320, ge=32, le=4096, description="Long side at which they are compared, in pixels."
     )
-    crf: int = Field(18, ge=0, le=40, description="x264 quality; lower is better and larger.")
+    num_pictures: int = Field(
+        4, ge=0, le=5000, description="Of these, how many are kept as pictures."
+    )
+    min_coverage: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="Below this share of the photos' pixels covered by the mesh, the report warns "
+        "of poor geometry.",
+    )
+    max_depth_inconsistency: float = Field(
+        0.05,
+        ge=0,
+        le=1,
+        description="Above this share of surface points that other views see through, it does, "
+        "too.",
+    )
+    require_geometry: bool = Field(
+        False, description="Fail the job with geometry_poor in place of that warning."
+    )
 
 
 class ReportOptions(StageOptions):
     """The report has no options."""
-
-
-def _field_of(
-    annotation: Any, field: dataclasses.Field[Any], default: Any = None
-) -> tuple[Any, Any]:
-    """A dataclass field as pydantic wants it: (annotation, FieldInfo).
-
-    default: plain, in place of the field's own.
-    """
-    meta = dict(field.metadata)
-    description = meta.get("help", "")
-    if "unit" in meta:
-        description = f"{description} Unit: {meta['unit']}."
-    bounds = {key: meta[key] for key in ("ge", "le") if key in meta}
-    if "choices" in meta:
-        annotation = Literal[allowed_names(meta)]
-        bounds = {}
-    elif typing.get_origin(annotation) is tuple:
-        (item, *_) = typing.get_args(annotation)
-        item_model = _model_of(item) if dataclasses.is_dataclass(item) else item
-        inner: Any = Annotated[item_model, Field(**bounds)] if bounds else item_model
-        annotation = Annotated[tuple[inner, ...], Field(min_length=1, max_length=8)]
-        bounds = {}
-    elif dataclasses.is_dataclass(annotation):
-        annotation = _model_of(annotation)
-    if default is None and field.default_factory is not dataclasses.MISSING:
-        default = _plain(field.default_factory())
-    if default is not None:
-        return annotation, Field(default_factory=lambda: default, description=description, **bounds)
-    return annotation, Field(default=field.default, description=description, **bounds)
-
-
-def _plain(value: Any) -> Any:
-    """A dataclass, or a tuple of them, as plain data."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dataclasses.asdict(value)
-    if isinstance(value, tuple):
-        return tuple(_plain(item) for item in value)
-    return value
-
-
-_MODELS: dict[tuple[type, str], type[StageOptions]] = {}
-
-
-def _model_of(cls: Any, method: Method | None = None) -> type[StageOptions]:
-    """The pydantic model with the fields, defaults and bounds of a dataclass.
-
-    method: for `TrainConfig`, whose own options its `model` holds.
-    """
-    key = (cls, "" if method is None else method.name)
-    if key not in _MODELS:
-        name = cls.__name__.replace("Config", "Options")
-        hints = typing.get_type_hints(cls)
-        fields: dict[str, Any] = {
-            field.name: _field_of(hints[field.name], field) for field in dataclasses.fields(cls)
-        }
-        if method is not None:
-            name += "".join(part.title() for part in method.name.split("-"))
-            fields |= _fields_of_method(method)
-        _MODELS[key] = create_model(name, __base__=StageOptions, __doc__=cls.__doc__, **fields)
-    return _MODELS[key]
-
-
-def _fields_of_method(method: Method) -> dict[str, Any]:
-    """The fields of `TrainConfig` in which one method differs from another."""
-    defaults = default_train_config(method.name)
-    fields: dict[str, Any] = {
-        "method": (Literal[method.name], Field(method.name, description=method.summary)),
-        "model": (
-            _model_of(method.config),
-            Field(
-                default_factory=lambda: _plain(defaults.model), description="The model's options."
-            ),
-        ),
-    }
-    for name in method.train:
-        item = next(field for field in dataclasses.fields(TrainConfig) if field.name == name)
-        value = _plain(getattr(defaults, name))
-        fields[name] = _field_of(typing.get_type_hints(TrainConfig)[name], item, value)
-    return fields
 
 
 def method_names() -> tuple[str, ...]:
@@ -271,7 +195,7 @@ def method_names() -> tuple[str, ...]:
 def train_options(method: str) -> type[StageOptions]:
     """`TrainConfig` with the options of a method, checked. Raises OptionsError for no method."""
     try:
-        return _model_of(TrainConfig, find_method(method))
+        return model_of(TrainConfig, find_method(method))
     except NerfError as error:
         raise OptionsError([("train.method", error.message)]) from error
 
@@ -279,12 +203,7 @@ def train_options(method: str) -> type[StageOptions]:
 TrainOptions: type[StageOptions] = train_options(NERFACTO.name)
 """`TrainConfig` with the options of the default method, checked."""
 
-if TYPE_CHECKING:
-    RenderOptions = StageOptions
-else:
-    RenderOptions = _model_of(RenderConfig)
-
-EvaluateOptions: type[StageOptions] = _model_of(EvaluateConfig)
+EvaluateOptions: type[StageOptions] = model_of(EvaluateConfig)
 """`EvaluateConfig`, checked."""
 
 
@@ -300,22 +219,17 @@ def evaluate_config(options: StageOptions) -> EvaluateConfig:
     return config
 
 
-def render_config(options: RenderingOptions) -> RenderConfig:
-    """What the renderer understands, from checked options."""
-    config: RenderConfig = config_from_dict(RenderConfig, options.render.model_dump())
-    return config
-
-
 STAGE_OPTIONS: types.MappingProxyType[str, type[StageOptions]] = types.MappingProxyType(
     {
         "ingest": IngestOptions,
         "frames": FramesOptions,
         "poses": PosesOptions,
+        "depth": DepthOptions,
+        "draft": DraftOptions,
         "train": TrainOptions,
         "evaluate": EvaluateOptions,
-        "pointcloud": PointcloudOptions,
-        "mesh": MeshOptions,
-        "video": VideoOptions,
+        **{export.kind: export.options for export in EXPORTS},
+        "assess": AssessOptions,
         "report": ReportOptions,
     }
 )
@@ -359,7 +273,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                         "optimizer": {"lr": 0.015, "decay_steps": 1500, "lr_final": 1e-3},
                     },
                     "pointcloud": {"num_points": 200_000},
-                    "mesh": {"num_views": 48, "render_long_side_px": 240},
+                    "mesh": {"render_long_side_px": 240},
                     "video": {"num_frames": 96, "long_side_px": 480},
                 },
             ),
@@ -438,7 +352,20 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
         resolved[name] = checked.model_dump(mode="json")
     if errors:
         raise OptionsError(errors)
+    _hold_out_the_same(resolved, overrides)
     return resolved
+
+
+def _hold_out_the_same(resolved: dict[str, dict[str, Any]], overrides: dict[str, Any]) -> None:
+    """What `train` holds out takes no part in `depth` either.
+
+    Raises OptionsError where somebody asks for another thing than that.
+    """
+    data, depth = resolved["train"]["data"], resolved["depth"]
+    same = {name: data[name] for name in depth["held_out"]}
+    if "held_out" in overrides.get("depth", {}) and depth["held_out"] != same:
+        raise OptionsError([("depth.held_out", "must be as in train.data: set it there alone")])
+    depth["held_out"] = same
 
 
 def _train_ground(

@@ -1,18 +1,40 @@
 """The stages in order: the product's table of contents.
 
-Stages are named by dotted path, so that the API can read this file without importing torch.
+Stages are named by dotted path, so that the API can read this file without importing torch. Those
+that export the trained scene come from `pipelines.exports.catalogue`. Which of them a capture has
+no use for follows from what its importer brings.
 """
 
 from __future__ import annotations
 
 import importlib
 
+from pipelines.captures.catalogue import importer_of
+from pipelines.captures.importer import Brings
+from pipelines.exports.catalogue import EXPORTS, KINDS
+from pipelines.exports.export import Export
 from pipelines.stage import Artifact, Stage, StageFunction
+
+
+def _export_stage(export: Export) -> Stage:
+    """The stage that makes one export of the catalogue."""
+    return Stage(
+        name=export.kind,
+        version=export.version,
+        after=("train",),
+        reads=(*export.reads, "train"),
+        run="pipelines.stages.export:run",
+        options=export.options.__name__,
+        needs_gpu=export.needs_gpu,
+        time_limit_s=export.time_limit_s,
+        artifacts=export.artifacts,
+    )
+
 
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=1,
+        version=2,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",
@@ -21,7 +43,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="frames",
-        version=1,
+        version=2,
         after=("ingest",),
         reads=("ingest",),
         run="pipelines.stages.frames:run",
@@ -30,7 +52,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=2,
+        version=3,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",
@@ -38,10 +60,32 @@ STAGES: tuple[Stage, ...] = (
         time_limit_s=6 * 3600.0,
     ),
     Stage(
-        name="train",
-        version=2,
+        name="depth",
+        version=1,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
+        run="pipelines.stages.depth:run",
+        options="DepthOptions",
+        time_limit_s=6 * 3600.0,
+    ),
+    Stage(
+        name="draft",
+        version=1,
+        after=("depth",),
+        reads=("ingest", "frames", "poses", "depth"),
+        run="pipelines.stages.draft:run",
+        options="DraftOptions",
+        time_limit_s=3600.0,
+        artifacts=(
+            Artifact("draft.glb", "draft.glb", "model/gltf-binary", "any glTF viewer, Blender"),
+            Artifact("draft.jpg", "draft.jpg", "image/jpeg", "any picture viewer"),
+        ),
+    ),
+    Stage(
+        name="train",
+        version=3,
+        after=("depth",),
+        reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.train:run",
         options="TrainOptions",
         needs_gpu=True,
@@ -66,67 +110,30 @@ STAGES: tuple[Stage, ...] = (
         needs_gpu=True,
         time_limit_s=6 * 3600.0,
     ),
+    *(_export_stage(export) for export in EXPORTS),
     Stage(
-        name="pointcloud",
-        version=1,
-        after=("train",),
-        reads=("train",),
-        run="pipelines.stages.pointcloud:run",
-        options="PointcloudOptions",
-        needs_gpu=True,
-        time_limit_s=6 * 3600.0,
-        artifacts=(
-            Artifact(
-                "pointcloud.ply",
-                "pointcloud.ply",
-                "application/octet-stream",
-                "MeshLab, CloudCompare, Blender",
-            ),
-        ),
-    ),
-    Stage(
-        name="mesh",
-        version=1,
-        after=("train",),
-        reads=("train",),
-        run="pipelines.stages.mesh:run",
-        options="MeshOptions",
-        needs_gpu=True,
-        time_limit_s=6 * 3600.0,
-        artifacts=(
-            Artifact("mesh.glb", "mesh.glb", "model/gltf-binary", "any glTF viewer, Blender"),
-            Artifact(
-                "mesh.ply", "mesh.ply", "application/octet-stream", "MeshLab, CloudCompare, Blender"
-            ),
-        ),
-    ),
-    Stage(
-        name="video",
-        version=1,
-        after=("train",),
-        reads=("train",),
-        run="pipelines.stages.video:run",
-        options="VideoOptions",
-        needs_gpu=True,
-        time_limit_s=6 * 3600.0,
-        artifacts=(
-            Artifact("video.mp4", "video.mp4", "video/mp4", "any browser or player"),
-            Artifact("preview.jpg", "preview.jpg", "image/jpeg", "any picture viewer"),
-        ),
+        name="assess",
+        version=2,
+        after=("evaluate", "pointcloud", "mesh"),
+        reads=("ingest", "frames", "poses", "depth", "train", "evaluate", "pointcloud", "mesh"),
+        run="pipelines.stages.assess:run",
+        options="AssessOptions",
+        time_limit_s=3600.0,
     ),
     Stage(
         name="report",
-        version=1,
-        after=("evaluate", "pointcloud", "mesh", "video"),
+        version=2,
+        after=("draft", "evaluate", *KINDS, "assess"),
         reads=(
             "ingest",
             "frames",
             "poses",
+            "depth",
+            "draft",
             "train",
             "evaluate",
-            "pointcloud",
-            "mesh",
-            "video",
+            *KINDS,
+            "assess",
         ),
         run="pipelines.stages.report:run",
         options="ReportOptions",
@@ -138,8 +145,11 @@ STAGES: tuple[Stage, ...] = (
 STAGE_NAMES: tuple[str, ...] = tuple(stage.name for stage in STAGES)
 _BY_NAME = {stage.name: stage for stage in STAGES}
 
-POSED_KINDS: frozenset[str] = frozenset({"nerfstudio", "polycam", "record3d"})
-"""Captures that carry camera poses: they skip `poses`."""
+_SKIPPED: dict[Brings, frozenset[str]] = {
+    "film": frozenset(),
+    "photos": frozenset({"frames"}),
+    "poses": frozenset({"frames", "poses"}),
+}
 
 
 def get_stage(name: str) -> Stage:
@@ -148,13 +158,8 @@ def get_stage(name: str) -> Stage:
 
 
 def skipped_stages(kind: str) -> frozenset[str]:
-    """The stages that a capture of this kind has no use for."""
-    skipped: set[str] = set()
-    if kind != "video":
-        skipped.add("frames")
-    if kind in POSED_KINDS:
-        skipped.add("poses")
-    return frozenset(skipped)
+    """The stages that a capture of this kind has no use for. Raises KeyError for an unknown one."""
+    return _SKIPPED[importer_of(kind).brings]
 
 
 def load_function(stage: Stage) -> StageFunction:

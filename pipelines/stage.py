@@ -16,6 +16,9 @@ from typing import Any, Protocol
 from pipelines.errors import Cancelled
 from pipelines.workspace import Workspace
 
+REPORT = "report.json"
+"""What a stage, or a whole job, says of itself in its own words."""
+
 
 @dataclass(frozen=True)
 class Artifact:
@@ -40,7 +43,7 @@ class Stage:
     after: stages that must have succeeded or been skipped; their folders are the inputs.
     reads: stages whose folders the stage reads (a subset of all that come before it).
     run: dotted path "module:function" of `(options, ctx) -> summary`; resolved only where it runs.
-    options: name of the options class in `pipelines.options`.
+    options: name of its options class, which `pipelines.options.STAGE_OPTIONS` holds.
     needs_gpu: whether a GPU worker should take it when there is one.
     time_limit_s: hard limit for one attempt.
     """
@@ -72,7 +75,8 @@ class StageContext:
 
     stage: its name.
     workspace: the job's folder; a stage reads earlier stages' folders from it.
-    out: the folder the stage writes to, empty at the start, published as a whole afterwards.
+    out: the folder the stage writes to, empty at the start, published as a whole afterwards. Of a
+        stage that raises PipelineError its `report.json` is kept, if it wrote one (`REPORT`).
     checkpoint: a folder that outlives a failed attempt, also when the next one runs elsewhere;
         a stage that calls `checkpoint_saved` after writing it can go on from there.
     seed: fixed per job, so that a run can be repeated.

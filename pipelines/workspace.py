@@ -6,13 +6,17 @@ JOB/
   ingest/                   capture.json, images/ (photos and app exports), cameras.json (posed)
   frames/                   frames.json, images/ (only for videos)
   poses/                    cameras.json, report.json, points.ply (only where no poses came)
+  depth/                    maps.json, maps/, depth.jpg, report.json
+  draft/                    draft.glb, draft.jpg
   train/                    model.zip, cameras.json, previews/
   evaluate/                 metrics.json, images/
-  pointcloud/ mesh/ video/  the assets
-  report/                   report.json
+  <export>/                 what `pipelines.exports.kinds` writes: pointcloud/, mesh/, video/, ...
+  assess/                   assets.json, images/
+  report/                   report.json; of a job that failed, without a manifest
   <stage>/manifest.json     written last: a folder with a manifest is complete
   .partial/<stage>/         what a running stage writes
   .checkpoint/<stage>/      what outlives a failed attempt
+  .failed/<stage>/          report.json, where a stage that failed wrote one
 """
 
 from __future__ import annotations
@@ -52,6 +56,10 @@ class Workspace:
     def checkpoint(self, name: str) -> Path:
         """What outlives a failed attempt of a stage."""
         return self.root / ".checkpoint" / name
+
+    def failed(self, name: str) -> Path:
+        """What a stage that failed left behind to explain it."""
+        return self.root / ".failed" / name
 
     def is_complete(self, name: str) -> bool:
         """Whether the stage's folder was published with its manifest."""

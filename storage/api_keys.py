@@ -1,9 +1,8 @@
-"""The API's keys: 256 random bits each, of which the database holds the SHA-256 alone."""
+"""The API's keys, of which the database holds the SHA-256 alone."""
 
 from __future__ import annotations
 
 import hashlib
-import secrets
 from datetime import datetime, timedelta
 
 from sqlalchemy import select
@@ -12,8 +11,8 @@ from sqlalchemy.orm import Session
 from storage.db import now
 from storage.errors import NotFoundError
 from storage.models import ApiKey
+from storage.new_keys import new_api_key
 
-KEY_PREFIX = "nw_"
 _USED_GRAIN = timedelta(minutes=1)  # last_used_at moves no oftener: a read should rarely write
 
 
@@ -23,7 +22,7 @@ def _digest(key: str) -> str:
 
 def create_api_key(session: Session, name: str) -> tuple[ApiKey, str]:
     """Make a key. The second value is the key itself, which cannot be shown again."""
-    key = KEY_PREFIX + secrets.token_urlsafe(32)
+    key = new_api_key()
     return ensure_api_key(session, key, name), key
 
 

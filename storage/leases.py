@@ -47,6 +47,18 @@ class Claim:
 
 
 @dataclass(frozen=True)
+class FailureReport:
+    """What an attempt published of its own failure. files: `{path, bytes, sha256}` below prefix."""
+
+    prefix: str
+    files: list[dict[str, Any]]
+
+    def values(self) -> dict[str, Any]:
+        """Columns of the stage's row."""
+        return {"output_prefix": self.prefix, "manifest": {"files": self.files}}
+
+
+@dataclass(frozen=True)
 class HeartbeatReply:
     """lost: the claim is void, stop and discard. cancel_requested: stop, then `cancel_stage`."""
 
@@ -192,11 +204,13 @@ def fail_stage(
     error: dict[str, Any],
     *,
     retryable: bool,
+    report: FailureReport | None = None,
     when: datetime | None = None,
 ) -> str:
     """An attempt ended with an error: try again later if that can help, else fail the job.
 
-    error: `{code, message, hint, ...}`. Returns the stage's new state.
+    error: `{code, message, hint, ...}`. report: kept where the job fails. Returns the stage's new
+    state.
     """
     job, stages, row = _held(session, claim)
     when = when or now(session)
@@ -205,7 +219,7 @@ def fail_stage(
         later = when + timedelta(seconds=backoff_s(failures))
         set_stage(session, row, "ready", when, not_before=later, error=error)
         return "ready"
-    fail_for_good(session, job, stages, row, error, when)
+    fail_for_good(session, job, stages, row, error, when, **(report.values() if report else {}))
     return "failed"
 
 
@@ -217,6 +231,7 @@ def _lose(
     error: dict[str, Any],
     max_crashes: int,
     when: datetime,
+    report: FailureReport | None = None,
 ) -> str:
     crashes = row.crashes + 1
     if job.state != "running":
@@ -224,7 +239,8 @@ def _lose(
         settle(session, job, stages, when)
         return "cancelled"
     if crashes >= max_crashes:
-        fail_for_good(session, job, stages, row, error, when, crashes=crashes)
+        values = report.values() if report else {}
+        fail_for_good(session, job, stages, row, error, when, crashes=crashes, **values)
         return "failed"
     later = when + timedelta(seconds=backoff_s(crashes - 1)) if crashes > 1 else None
     set_stage(session, row, "ready", when, crashes=crashes, not_before=later, error=error)
@@ -237,11 +253,15 @@ def crash_stage(
     error: dict[str, Any],
     *,
     max_crashes: int = MAX_CRASHES,
+    report: FailureReport | None = None,
     when: datetime | None = None,
 ) -> str:
-    """The stage's process died under the claim. The first retry is at once. The new state."""
+    """The stage's process died under the claim. The first retry is at once. The new state.
+
+    report: kept where the job fails.
+    """
     job, stages, row = _held(session, claim)
-    return _lose(session, job, stages, row, error, max_crashes, when or now(session))
+    return _lose(session, job, stages, row, error, max_crashes, when or now(session), report)
 
 
 def release_stage(session: Session, claim: Claim, when: datetime | None = None) -> str:

@@ -1,4 +1,4 @@
-"""The records. State columns change only through `storage.jobs`.
+"""The records. State columns change only through `storage.transitions`.
 
 A stage row carries its lease: `lease_token` rises by one with every claim and is the fencing token
 that every later write of that claim must show.

@@ -1,7 +1,8 @@
-"""Bytes under keys: one interface, with a local folder and S3 (`storage.objects_s3`) behind it.
+"""Bytes under keys: one interface, and the local folder behind it.
 
-Keys are relative POSIX paths made by `storage.keys`. A put is atomic: a reader sees the old object
-or the new one, whole. Errors: ObjectMissingError, ObjectStoreFullError, else ObjectStoreError.
+`storage.objects_s3` is the same in a bucket, `storage.open_objects` chooses. Keys are relative
+POSIX paths made by `storage.keys`. A put is atomic: a reader sees the old object or the new one,
+whole. Errors: ObjectMissingError, ObjectStoreFullError, else ObjectStoreError.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
-from urllib.parse import unquote, urlparse
 
 from storage.errors import (
     InvalidUrlError,
@@ -29,7 +29,6 @@ from storage.errors import (
     ObjectStoreError,
     ObjectStoreFullError,
 )
-from storage.settings import StorageSettings
 
 CHUNK_BYTES = 1 << 20
 _TEMPORARY = ".nerfworks-tmp"
@@ -256,19 +255,3 @@ class LocalObjectStore:
                 probe.write_bytes(b"ok")
             finally:
                 probe.unlink(missing_ok=True)
-
-
-def open_object_store(settings: StorageSettings) -> ObjectStore:
-    """The store that the settings name. Raises ValueError for an unknown kind of URL."""
-    url = urlparse(settings.resolved_objects_url)
-    if url.scheme == "file":
-        return LocalObjectStore(
-            Path(unquote(url.path)),
-            public_url=settings.public_url,
-            signing_key=settings.signing_key(),
-        )
-    if url.scheme == "s3" and url.netloc:
-        from storage.objects_s3 import S3ObjectStore
-
-        return S3ObjectStore(settings, bucket=url.netloc, prefix=url.path.strip("/"))
-    raise ValueError("NERFWORKS_OBJECTS_URL must be file:///folder or s3://bucket/prefix")

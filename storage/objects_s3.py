@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import boto3
 from boto3.exceptions import Boto3Error
@@ -16,6 +15,7 @@ from boto3.s3.transfer import TransferConfig
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
+from storage.download_names import content_disposition
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
 from storage.objects import CHUNK_BYTES, ObjectStat, OnBytes, check_key, check_prefix
 from storage.settings import StorageSettings
@@ -40,15 +40,6 @@ def _translated(key: str) -> Iterator[None]:
         raise ObjectStoreError(f"{key}: the object store refused ({code}).") from error
     except (BotoCoreError, Boto3Error) as error:
         raise ObjectStoreError(f"{key}: the object store did not answer.") from error
-
-
-def content_disposition(filename: str) -> str:
-    """`Content-Disposition` of a download (RFC 6266): an ASCII name and the true one."""
-    plain = "".join(
-        char if char.isascii() and char.isprintable() and char not in '"\\;' else "_"
-        for char in filename
-    )
-    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(filename, safe='')}"
 
 
 class S3ObjectStore:

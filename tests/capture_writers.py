@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.cameras_file import CamerasFile, Intrinsics
 from pipelines.sample.film import encode_sideways, phone_camera, render_all, walk
 from pipelines.sample.scene import depth_image, pose_matrix
+from pipelines.scene.cameras_file import CamerasFile, Intrinsics
 
 Floats = NDArray[np.float64]
 

@@ -14,6 +14,7 @@ from pipelines.sample.film import film_capture
 SMALL: dict[str, Any] = {
     "frames": {"num_frames": 40, "long_side_px": 640},
     "poses": {"max_image_px": 640, "num_features": 2048},
+    "depth": {"long_side_px": 160, "num_planes": 64},
     "train": {
         "max_steps": 400,
         "rays_per_step": 1024,

@@ -1,7 +1,9 @@
 """The import rules of docs/architecture.md, checked on the syntax tree.
 
-Only imports that run when a module is loaded or a function called count alike: a rule that could be
-dodged by importing inside a function would not be one.
+Every import counts, also one inside a function or for the type checker alone: a rule that could be
+dodged by importing later would not be one. What is named in a string and loaded when it is asked
+for (stages in `registry`, methods in `options.catalogue`, entry points of other packages) is no
+import: there the caller knows a name only.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ API_MAY_IMPORT = (
     "pipelines.stage",
     "pipelines.errors",
     "pipelines.captures.sniff",
+    "pipelines.captures.catalogue",
 )
 
 # What each room may take from the others, by prefix.
@@ -41,6 +44,67 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "pipelines": ("pipelines",),
     "deploy": ("deploy", "storage", "api.cli_display", "api.client", "pipelines.options"),
 }
+# What lies in pipelines/ beside its rooms, lowest first, and what of a room it may name.
+FRAME = (
+    "errors",
+    "workspace",
+    "stage",
+    "option_models",
+    "registry",
+    "options",
+    "manifest",
+    "cli",
+    "__main__",
+)
+FRAME_MAY_IMPORT: dict[str, tuple[str, ...]] = {
+    "option_models": ("pipelines.nerf.options", "pipelines.nerf.plugins"),
+    "registry": (
+        "pipelines.captures.catalogue",
+        "pipelines.captures.importer",
+        "pipelines.exports.catalogue",
+        "pipelines.exports.export",
+    ),
+    "options": (
+        "pipelines.captures.minimum",
+        "pipelines.exports.catalogue",
+        "pipelines.exports.options",  # the draft is cut as exports are
+        "pipelines.nerf.options",
+        "pipelines.nerf.plugins",
+        "pipelines.nerf.errors",
+    ),
+    "cli": ("pipelines.captures.sniff", "pipelines.stages.report"),
+}
+# Rooms lowest first; those of a line do not know each other. The longest name that fits counts: a
+# file may stand lower than its folder.
+PIPELINE_ROOMS: tuple[tuple[str, ...], ...] = (
+    *((name,) for name in FRAME),
+    ("nerf",),
+    ("scene",),
+    ("captures.magic",),  # what a file is by its first bytes: the programs in tools ask that too
+    ("tools",),
+    ("captures", "sfm", "judging"),
+    ("exports",),
+    ("stages", "sample"),
+)
+NERF_ROOMS: tuple[tuple[str, ...], ...] = (
+    ("errors",),
+    ("plugins",),
+    ("options",),
+    ("space",),
+    ("along_ray",),
+    ("networks", "engines.cpu.parts", "engines.gpu.parts"),
+    ("engines.hash_encoders",),
+    ("engines.cpu.train",),
+    ("models",),
+    ("data",),
+    ("engines.cpu.render", "engines.cpu.stereo", "engines.gpu"),
+    ("stereo",),
+    ("judging",),
+    ("training",),
+    ("renderer",),
+    ("compiling",),
+)
+
 # `nerfworks up` starts the launcher: the one way from the command into deploy.
 EXCEPTIONS = {("api/cli.py", "deploy.local")}
 
@@ -99,6 +163,52 @@ def test_stages_never_see_storage() -> None:
     assert not wrong, "a stage works on folders only:\n" + "\n".join(wrong)
 
 
+def level_of(name: str, rooms: tuple[tuple[str, ...], ...]) -> tuple[int, str] | None:
+    """(level, room) of a module, named from where the rooms are; None for one without a room."""
+    fitting = [
+        (level, room) for level, line in enumerate(rooms) for room in line if within(name, (room,))
+    ]
+    return max(fitting, key=lambda found: len(found[1]), default=None)
+
+
+def out_of_order(
+    package: str, rooms: tuple[tuple[str, ...], ...], allowed: dict[str, tuple[str, ...]]
+) -> list[str]:
+    """What files import from rooms that are not below theirs, and files that have no room."""
+    wrong = []
+    for path in files_of(package.replace(".", "/")):
+        if path.name == "__init__.py":
+            continue
+        relative = path.relative_to(ROOT)
+        name = ".".join(relative.with_suffix("").parts).removeprefix(package + ".")
+        here = level_of(name, rooms)
+        if here is None:
+            wrong.append(f"{relative} stands in no room: give it a place in this test's list")
+            continue
+        for line, target in imports_of(path):
+            if not within(target, (package,)) or within(target, allowed.get(name, ())):
+                continue
+            there = level_of(target.removeprefix(package + "."), rooms)
+            if there is None or not (there[1] == here[1] or there[0] < here[0]):
+                wrong.append(f"{relative}:{line} imports {target}")
+    return wrong
+
+
+def test_the_root_of_pipelines_holds_the_frame_alone() -> None:
+    found = {path.stem for path in (ROOT / "pipelines").glob("*.py")} - {"__init__"}
+    assert found == set(FRAME), "a file of pipelines/ belongs into one of its rooms"
+
+
+def test_rooms_of_pipelines_import_only_lower_ones() -> None:
+    wrong = out_of_order("pipelines", PIPELINE_ROOMS, FRAME_MAY_IMPORT)
+    assert not wrong, "lowest first, as PIPELINE_ROOMS has them:\n" + "\n".join(wrong)
+
+
+def test_rooms_of_nerf_import_only_lower_ones() -> None:
+    wrong = out_of_order("pipelines.nerf", NERF_ROOMS, {})
+    assert not wrong, "lowest first, as NERF_ROOMS has them:\n" + "\n".join(wrong)
+
+
 @pytest.mark.parametrize("module", ["api.app", "api.client", "nerfworks", "worker.app"])
 def test_loading_a_light_process_loads_no_heavy_library(module: str) -> None:
     program = (
@@ -111,25 +221,17 @@ def test_loading_a_light_process_loads_no_heavy_library(module: str) -> None:
 
 
 def test_no_import_cycles_between_modules() -> None:
-    graph: dict[str, set[str]] = {}
     modules = {
         ".".join(path.relative_to(ROOT).with_suffix("").parts): path
         for room in ROOMS
         for path in files_of(room)
         if path.name != "__init__.py"
     }
+    graph: dict[str, set[str]] = {}
     for name, path in modules.items():
-        tree = ast.parse(path.read_text("utf-8"))
-        top_level = ast.Module(
-            [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], []
-        )
-        targets = set()
-        for node in top_level.body:
-            if isinstance(node, ast.Import):
-                targets |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                targets |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-        graph[name] = targets & modules.keys()
+        imported = {target for _, target in imports_of(path)}
+        # `from package import name`: the name may be a module or live in one.
+        graph[name] = (imported | {target.rpartition(".")[0] for target in imported}) & {*modules}
     done: set[str] = set()
 
     def visit(name: str, trail: tuple[str, ...]) -> None:
@@ -164,3 +266,24 @@ def test_programs_are_never_started_through_a_shell() -> None:
         and not (isinstance(node.value, ast.Constant) and node.value.value is False)
     ]
     assert not wrong, f"use an argument list: {wrong}"
+
+
+def test_kernels_take_nothing_from_rooms_that_their_cache_does_not_follow() -> None:
+    nerf = ROOT / "pipelines" / "nerf"
+    runtime = ast.parse((nerf / "engines/cpu/parts/runtime.py").read_text("utf-8"))
+    (rooms,) = (
+        ast.literal_eval(node.value)
+        for node in runtime.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "FROZEN_ROOMS"
+    )
+    followed = tuple(f"pipelines.nerf.{room.replace('/', '.')}" for room in rooms)
+    assert all((nerf / room).is_dir() for room in rooms)
+    # Errors and plugins hold no numbers.
+    allowed = (*followed, "pipelines.nerf.errors", "pipelines.nerf.plugins")
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {name}"
+        for path in files_of("pipelines/nerf/engines/cpu")
+        for line, name in imports_of(path)
+        if within(name, ROOMS) and not within(name, allowed)
+    ]
+    assert not wrong, "add the room to FROZEN_ROOMS, or kernels go stale:\n" + "\n".join(wrong)

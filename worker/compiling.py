@@ -2,7 +2,7 @@
 
 In processes of their own with the least priority, one for each part of a job: they use what the
 stages leave. A stage that needs kernels which are not there yet waits for them, or takes their
-compilation over where they get no processor time (`pipelines.nerf.kernels.warm`).
+compilation over where they get no processor time (`pipelines.nerf.compiling`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 from pipelines.options import PRESETS, resolve_options, stage_options, train_config
 from worker.process import scrubbed_environment
 
-_PARTS = ("training", "rendering")
+_PARTS = ("stereo", "training", "rendering")
 
 
 class KernelCompiler:
@@ -36,7 +36,7 @@ class KernelCompiler:
         for part in _PARTS:
             process = subprocess.Popen(
                 [
-                    *(sys.executable, "-m", "pipelines.nerf.kernels.warm", part),
+                    *(sys.executable, "-m", "pipelines.nerf.compiling", part),
                     *("--background", "--parent", str(os.getpid())),
                 ],
                 stdin=subprocess.PIPE,

@@ -26,6 +26,7 @@ from storage.db import Database
 from storage.errors import LostLeaseError, NotFoundError, StorageError
 from storage.leases import (
     Claim,
+    FailureReport,
     cancel_stage,
     crash_stage,
     fail_stage,
@@ -35,6 +36,7 @@ from storage.leases import (
 from storage.objects import ObjectStore
 from storage.queries import StageWork, stage_work
 from worker.checkpoints import CheckpointUploader, Snapshot
+from worker.failures import publish_failure
 from worker.outcomes import (
     MAX_MEMORY_CRASHES,
     StageCrashedError,
@@ -150,8 +152,8 @@ class Runner:
                     session, claim, manifest=manifest, output_prefix=prefix
                 )
             except Exception as error:  # noqa: BLE001 every end of an attempt is recorded
-                record = self._record_of(claim, error)
                 self._discard(prefix)
+                record = self._record_of(claim, error, prefix)
             keeper.flush()
             try:
                 ready = self._record(record)
@@ -160,6 +162,8 @@ class Runner:
                 self._discard(prefix)
                 return []
         if not isinstance(ready, list):
+            if ready != "failed":
+                self._discard(prefix)
             _log.info("%s: %s", claim.stage_id, ready or "cancelled")
             return []
         _log.info("%s: succeeded", claim.stage_id)
@@ -256,8 +260,8 @@ class Runner:
             self.close()  # also where memory ran out and the process lives: it gives it back
             raise
         except StageFailedError as error:
-            if error.error["code"] == "internal_error":
-                self.close()  # its state cannot be trusted
+            if error.error["code"] in ("internal_error", "gpu_lost"):
+                self.close()  # its state cannot be trusted, or its GPU answers it no more
             raise
         finally:
             process.finish_log(LOG_END_S if process.is_alive() else 0.0)
@@ -321,8 +325,8 @@ class Runner:
                 return
         self.close()
 
-    def _record_of(self, claim: Claim, error: Exception) -> Callable[[Session], Any]:
-        """The operation that records how an attempt ended."""
+    def _record_of(self, claim: Claim, error: Exception, prefix: str) -> Callable[[Session], Any]:
+        """The operation that records how an attempt ended. prefix: for what it says of that."""
         if isinstance(error, StopRunError):
             if error.reason == "lost":
                 return lambda session: _raise(LostLeaseError(claim.stage_id))
@@ -332,8 +336,9 @@ class Runner:
         if isinstance(error, StageCrashedError):
             crash = error
             _log.warning("%s: %s", claim.stage_id, crash.error["message"])
+            said = self._publish_failure(claim, crash.error, prefix)
             return lambda session: crash_stage(
-                session, claim, crash.error, max_crashes=crash.max_crashes
+                session, claim, crash.error, max_crashes=crash.max_crashes, report=said
             )
         if isinstance(error, StageFailedError):
             failure = error.error
@@ -341,7 +346,15 @@ class Runner:
             _log.error("%s: the attempt broke off", claim.stage_id, exc_info=error)
             failure = failure_of(claim.name, error)
         retryable = bool(failure.pop("retryable", False))
-        return lambda session: fail_stage(session, claim, failure, retryable=retryable)
+        report = self._publish_failure(claim, failure, prefix)
+        return lambda session: fail_stage(
+            session, claim, failure, retryable=retryable, report=report
+        )
+
+    def _publish_failure(
+        self, claim: Claim, error: dict[str, Any], prefix: str
+    ) -> FailureReport | None:
+        return publish_failure(self._database, self._store, claim, self._work_dir, error, prefix)
 
     def _record(self, operation: Callable[[Session], Result]) -> Result:
         """Run a closing operation, again while the database is away and the lease may hold."""

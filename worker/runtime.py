@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from storage.db import Database
 from storage.leases import Claim, claim_stage, release_worker
-from storage.objects import open_object_store
+from storage.open_objects import open_object_store
 from storage.queries import WaitingStage, ready_unclaimed
 from storage.queue import QUEUE_GPU, Bell, queue_for
 from storage.records import forget_worker, has_live_gpu, register_worker

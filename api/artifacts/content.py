@@ -5,7 +5,8 @@ from __future__ import annotations
 from fastapi import Request
 from starlette.responses import Response, StreamingResponse
 
-from api.artifacts.ranges import content_disposition, etag_of, parse_range, tag_listed
+from api.artifacts.ranges import etag_of, parse_range, tag_listed
+from storage.download_names import content_disposition
 from storage.objects import ObjectStore
 
 

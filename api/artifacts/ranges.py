@@ -1,12 +1,11 @@
-"""HTTP's rules for downloads: byte ranges, entity tags and file names. Pure functions.
+"""HTTP's rules for downloads: byte ranges and entity tags. Pure functions.
 
-Source: RFC 9110 sections 13 (conditions) and 14 (ranges), RFC 6266 (Content-Disposition).
+Source: RFC 9110 sections 13 (conditions) and 14 (ranges).
 """
 
 from __future__ import annotations
 
 import re
-from urllib.parse import quote
 
 from api.problems import BadRangeError
 
@@ -54,15 +53,3 @@ def parse_range(header: str | None, size: int, if_range: str | None, etag: str) 
             headers={"Content-Range": f"bytes */{size}", "Accept-Ranges": "bytes"},
         )
     return range(first, last + 1)
-
-
-def content_disposition(name: str) -> str:
-    """`attachment` with a file name that no header parser can be fooled by.
-
-    The plain form holds safe ASCII only; the extended form the whole name in UTF-8.
-    """
-    name = "".join(c for c in name if c.isprintable()).replace("\\", "/").rsplit("/", 1)[-1]
-    name = name.strip(" .") or "download"
-    plain = re.sub(r"[^A-Za-z0-9 ._()+-]", "_", name)
-    extended = quote(name.encode("utf-8", "replace"), safe="")
-    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{extended}"

@@ -11,11 +11,12 @@ from fastapi import Request
 from api.artifacts.schemas import ArtifactView
 from api.deps import Services
 from api.problems import MissingError
-from pipelines.registry import STAGES
-from pipelines.stage import Artifact
+from pipelines.registry import STAGES, get_stage
+from pipelines.stage import REPORT, Artifact
 from storage.models import Job
 from storage.objects import LocalObjectStore
 
+(_REPORT,) = (found for found in get_stage("report").artifacts if found.path == REPORT)
 _LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
@@ -30,7 +31,10 @@ class Published:
 
 
 def published(job: Job) -> Iterator[Published]:
-    """The artifacts of the job's succeeded stages. The job is loaded with its manifests."""
+    """The artifacts of the job's succeeded stages; of a job that failed, its report, too.
+
+    The job is loaded with its manifests.
+    """
     rows = {row.name: row for row in job.stages}
     for stage in STAGES:
         row = rows.get(stage.name)
@@ -42,6 +46,12 @@ def published(job: Job) -> Iterator[Published]:
             if entry is not None:
                 key = row.output_prefix + artifact.path
                 yield Published(artifact, key, entry["bytes"], entry["sha256"])
+    failed = rows.get(str((job.error or {}).get("stage")))
+    if failed is not None and failed.state == "failed" and failed.output_prefix:
+        for entry in (failed.manifest or {}).get("files", []):
+            if entry["path"] == _REPORT.path:
+                key = failed.output_prefix + _REPORT.path
+                yield Published(_REPORT, key, entry["bytes"], entry["sha256"])
 
 
 def find(job: Job, name: str) -> Published:

@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from pipelines.captures.catalogue import KINDS
 from storage.models import Capture
 
 
@@ -15,7 +16,7 @@ class CaptureView(BaseModel):
 
     id: str
     filename: str = Field(description="As the client called it, without folders.")
-    kind: str = Field(description="What the bytes are: video, images, nerfstudio, polycam, ...")
+    kind: str = Field(description=f"What the bytes are: {', '.join(KINDS)}.")
     bytes: int
     sha256: str = Field(description="Of the bytes as they came, in hex.")
     details: dict[str, Any] = Field(description="Facts found while looking at the bytes.")

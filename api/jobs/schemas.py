@@ -16,6 +16,7 @@ from storage.models import Job, StageRow
 MAX_LABELS = 50
 _LABEL_KEY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._/-]{0,62}")
 _METRICS = ("psnr", "ssim", "lpips", "num_images", "width", "height")
+_ASSETS = ("mesh", "cloud", "depth", "depth_agreement", "warnings")
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
 StageState = Literal["blocked", "ready", "running", "succeeded", "failed", "cancelled", "skipped"]
@@ -103,6 +104,10 @@ class JobSummary(BaseModel):
     metrics: dict[str, float | int | None] | None = Field(
         description="Held-out quality, once measured: psnr in dB, ssim, num_images, width, height."
     )
+    assets: dict[str, Any] | None = Field(
+        description="The delivered mesh and cloud against held-out photos, once measured: mesh and "
+        "cloud {coverage, psnr, ssim, psnr_with_holes}, warnings [{code, message, hint}]."
+    )
     error: JobErrorView | None
     created_at: datetime
     started_at: datetime | None
@@ -122,6 +127,7 @@ class JobSummary(BaseModel):
             "capture_id": job.capture_id,
             "stages": [StageView.model_validate(row) for row in job.stages],
             "metrics": metrics_of(job.stages),
+            "assets": assets_of(job.stages),
             "error": None if job.error is None else JobErrorView.model_validate(job.error),
             "created_at": job.created_at,
             "started_at": job.started_at,
@@ -163,4 +169,12 @@ def metrics_of(stages: list[StageRow]) -> dict[str, float | int | None] | None:
     for row in stages:
         if row.name == "evaluate" and row.state == "succeeded" and row.summary:
             return {key: row.summary[key] for key in _METRICS if key in row.summary}
+    return None
+
+
+def assets_of(stages: list[StageRow]) -> dict[str, Any] | None:
+    """How mesh and cloud compare with photos, or None before that is known."""
+    for row in stages:
+        if row.name == "assess" and row.state == "succeeded" and row.summary:
+            return {key: row.summary[key] for key in _ASSETS if key in row.summary}
     return None

@@ -7,18 +7,30 @@ sizes: `pipelines.captures.unpack` counts again while it reads.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import re
 import stat
+import struct
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from pipelines.captures.magic import HEAD_BYTES, is_zip
 from pipelines.errors import CaptureError
 
-READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError)
+_READ_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    IndexError,
+    NotImplementedError,
+    OverflowError,
+    ValueError,
+)
 """What `zipfile` raises for an archive that is damaged or lies about itself."""
 
 _LOCAL_HEADER_BYTES = 30
@@ -143,12 +155,27 @@ def _check_duplicates(entries: Sequence[zipfile.ZipInfo]) -> None:
         seen.add(info.filename)
 
 
+@contextlib.contextmanager
+def reading() -> Iterator[None]:
+    """Turns what reading a damaged archive raises into CaptureError archive_damaged.
+
+    Offsets before the file's start end in an OSError: EINVAL from the kernel, or one without a
+    number. Any other is the disk's own, and passes.
+    """
+    try:
+        yield
+    except _READ_ERRORS as error:
+        raise damaged() from error
+    except OSError as error:
+        if error.errno not in (None, errno.EINVAL):
+            raise
+        raise damaged() from error
+
+
 def open_archive(path: Path) -> zipfile.ZipFile:
     """Open a zip for reading; nothing in it is checked yet. Raises CaptureError archive_damaged."""
-    try:
+    with reading():
         return zipfile.ZipFile(path)
-    except READ_ERRORS as error:
-        raise damaged() from error
 
 
 def checked_entries(archive: zipfile.ZipFile, limits: ArchiveLimits) -> dict[str, zipfile.ZipInfo]:
@@ -175,11 +202,8 @@ def checked_entries(archive: zipfile.ZipFile, limits: ArchiveLimits) -> dict[str
 
 def head_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     """The first bytes of an entry. Raises CaptureError where it is a zip itself, or damaged."""
-    try:
-        with archive.open(info) as file:
-            head = file.read(HEAD_BYTES)
-    except READ_ERRORS as error:
-        raise damaged() from error
+    with reading(), archive.open(info) as file:
+        head = file.read(HEAD_BYTES)
     if is_zip(head):
         raise _unsafe(f'The archive holds another archive: "{shown(info.filename)}".')
     return head

@@ -1,30 +1,30 @@
-"""Pictures out of an archive: decoded to be sure, and written without any metadata.
+"""Pictures out of an archive: decoded to be sure, and written as sRGB without any metadata.
 
-A photo's EXIF may hold where it was taken; nothing of it reaches a later stage. Photos without
-poses are turned upright by their EXIF orientation; pictures with poses are not, since their
-intrinsics speak of the pixels as stored.
+A photo's EXIF may hold where it was taken; only what `pipelines.captures.exif` keeps of it reaches
+a later stage, as data. Photos without poses are turned upright by their EXIF orientation; pictures
+with poses are not, since their intrinsics speak of the pixels as stored.
 """
 
 from __future__ import annotations
 
-import re
 import shutil
 import warnings
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import PIL.Image
 import PIL.ImageFile
 import PIL.ImageOps
 
 from pipelines.captures.archive_rules import shown
+from pipelines.captures.color_profiles import in_srgb
+from pipelines.captures.exif import Exif, read_exif
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 JPEG_QUALITY = 95
-MIN_IMAGES = 3
 # Segments of a JPEG that hold nothing private: JFIF and Adobe's note on the colour transform.
 _HARMLESS_SEGMENTS = frozenset({"APP0", "APP14"})
 _HARMLESS_PNG_KEYS = frozenset({"dpi", "gamma", "srgb", "aspect", "interlace"})
@@ -38,24 +38,17 @@ class Picture:
     source: str
     width: int
     height: int
+    exif: Exif
 
-    def as_dict(self) -> dict[str, str | int]:
+    def as_dict(self) -> dict[str, Any]:
         """As plain JSON, for `capture.json`."""
         return {
             "file": self.file,
             "source": self.source,
             "width": self.width,
             "height": self.height,
+            "exif": self.exif.as_dict(),
         }
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorts names as people count: "2.jpg" before "10.jpg"."""
-    return tuple(
-        (0, int(part), "") if part.isdigit() and part.isascii() else (1, 0, part)
-        for part in re.split(r"([0-9]+)", name)
-        if part
-    )
 
 
 def evenly_picked(count: int, most: int) -> list[int]:
@@ -81,6 +74,7 @@ class PictureWriter:
         self._max_pixels = max_pixels
         self._upright = upright
         self._raw = out / ".raw"
+        self._without_profile: list[str] = []
         for folder in ("images", "masks"):
             (out / folder).mkdir(parents=True, exist_ok=True)
 
@@ -98,21 +92,30 @@ class PictureWriter:
         kind = self._archive.image_format(name)
         self._archive.extract(name, self._raw)
         with self._opened(name, kind) as image:
-            orientation = image.getexif().get(0x0112, 1)
-            turned = self._upright and orientation in range(2, 9)
+            exif = read_exif(image)
+            turned = self._upright and exif.orientation not in (None, 1)
             suffix = ".png" if kind == "PNG" else ".jpg"
             file = f"images/{number:05d}{suffix}"
             target = self._out / file
             if not turned and _is_clean(image, self._raw):
                 shutil.copyfile(self._raw, target)
-                return Picture(file, name, image.width, image.height)
+                return Picture(file, name, image.width, image.height, exif)
             upright = PIL.ImageOps.exif_transpose(image) if turned else image
-            plain = _plain_rgb(upright)
+            plain = _plain_rgb(self._in_srgb(_eight_bit(upright), name))
             if suffix == ".png":
                 plain.save(target, "PNG", compress_level=3)
             else:
                 plain.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-            return Picture(file, name, plain.width, plain.height)
+            return Picture(file, name, plain.width, plain.height, exif)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be told about the pictures stored so far."""
+        names = self._without_profile
+        if not names:
+            return []
+        which = f'"{shown(names[0])}"' + (f" and {len(names) - 1} more" if names[1:] else "")
+        return [f"The colour profile of {which} cannot be used; taken as sRGB: colours may be off."]
 
     def store_mask(self, name: str, number: int, size: tuple[int, int]) -> str:
         """Write the mask `name` as a one-channel PNG of `size`; returns its path below `out`.
@@ -133,6 +136,16 @@ class PictureWriter:
                 self._out / file
             )
         return file
+
+    def _in_srgb(self, image: PIL.Image.Image, name: str) -> PIL.Image.Image:
+        """The picture's colours as sRGB; with an unusable profile as they are, and noted."""
+        try:
+            return in_srgb(image)
+        except CaptureError as error:
+            if error.code != "profile_unusable":
+                raise
+            self._without_profile.append(name)
+            return image
 
     def _opened(self, name: str, kind: str) -> PIL.Image.Image:
         """The extracted picture, fully decoded."""
@@ -164,7 +177,7 @@ def _undecodable(name: str, why: str) -> CaptureError:
 
 def _is_clean(image: PIL.Image.Image, raw: Path) -> bool:
     """Whether the bytes can be kept as they came: plain RGB, and nothing but the picture."""
-    if image.mode != "RGB":
+    if image.mode != "RGB" or image.info.get("icc_profile"):
         return False
     if image.format == "JPEG":
         segments = {name for name, _ in getattr(image, "applist", [])}
@@ -182,10 +195,17 @@ def _ends_at_its_end(raw: Path) -> bool:
     return data.rstrip(b"\0").endswith(b"\xff\xd9") and data.count(b"\xff\xd8\xff") == 1
 
 
+def _eight_bit(image: PIL.Image.Image) -> PIL.Image.Image:
+    """A grey picture of 16 bits with 8; others as they are."""
+    if not (image.mode.startswith("I;16") or image.mode == "I"):
+        return image
+    reduced = image.convert("I").point(lambda value: value / 257).convert("L")
+    reduced.info = dict(image.info)
+    return reduced
+
+
 def _plain_rgb(image: PIL.Image.Image) -> PIL.Image.Image:
     """The pixels as 8-bit RGB over white, in a new image that carries no metadata."""
-    if image.mode.startswith("I;16") or image.mode == "I":
-        image = image.convert("I").point(lambda value: value / 257).convert("L")
     if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
         layer = image.convert("RGBA")
         image = PIL.Image.new("RGB", layer.size, (255, 255, 255))
@@ -194,43 +214,3 @@ def _plain_rgb(image: PIL.Image.Image) -> PIL.Image.Image:
     clean = PIL.Image.new("RGB", rgb.size)
     clean.paste(rgb)
     return clean
-
-
-def store_all(
-    writer: PictureWriter, names: Sequence[str], on_done: Callable[[int], None]
-) -> tuple[dict[str, Picture], list[str]]:
-    """Write pictures in order; those that do not decode are left out if they are few.
-
-    on_done: called after each with how many are done.
-    Returns the pictures by name, and warnings. Raises CaptureError: image_undecodable where more
-    than one in ten does not decode, too_few_images where fewer than three are left.
-    """
-    pictures: dict[str, Picture] = {}
-    failures: list[CaptureError] = []
-    for done, name in enumerate(names, start=1):
-        try:
-            pictures[name] = writer.store(name, len(pictures) + 1)
-        except CaptureError as error:
-            if error.code != "image_undecodable":
-                raise
-            failures.append(error)
-        on_done(done)
-    if len(failures) * 10 > len(names):
-        raise CaptureError(
-            f"{len(failures)} of {len(names)} pictures cannot be used. {failures[0].message}",
-            code="image_undecodable",
-            hint="Check that the pictures open, and pack them again.",
-            details={"failed": [error.message for error in failures[:20]]},
-        )
-    require_enough(len(pictures))
-    return pictures, [f"Left out: {error.message}" for error in failures]
-
-
-def require_enough(count: int) -> None:
-    """Raise CaptureError too_few_images where no reconstruction could be made."""
-    if count < MIN_IMAGES:
-        raise CaptureError(
-            f"There are {count} usable pictures; at least {MIN_IMAGES} are needed.",
-            code="too_few_images",
-            hint="Send more pictures of the subject, 30 or more for a good result.",
-        )

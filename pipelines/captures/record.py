@@ -14,11 +14,12 @@ CAPTURE_JSON = "capture.json"
 class CaptureRecord:
     """What ingest found and wrote.
 
-    kind: one of `sniff.KINDS`. filename: what the sender called it; a label, never a path.
+    kind: one of `catalogue.KINDS`. filename: what the sender called it; a label, never a path.
     sha256: of the bytes that were sent.
     num_images: pictures in `ingest/images`; 0 for a video.
     video: `VideoInfo` as plain data, for a video.
-    images: file (relative to `ingest/`), source (name in the archive), width, height.
+    images: file (relative to `ingest/`), source (name in the archive), width, height, exif (see
+    `pipelines.captures.exif`).
     """
 
     kind: str

@@ -3,13 +3,12 @@
 The API imports this file: standard library only. Nothing is decoded and nothing unpacked; only an
 archive's directory and the first bytes of its entries are read.
 
-Kinds: `video`; `images` (a zip of photos); `nerfstudio` (a zip with `transforms.json`); `polycam`
-(a raw data export); `record3d` (an "EXR + RGB" export or an `.r3d` file).
+The formats, and which comes first where several would do: `pipelines.captures.catalogue`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from pipelines.captures.archive_rules import (
     head_of,
     open_archive,
 )
+from pipelines.captures.catalogue import claimed
+from pipelines.captures.importer import Claim, Listing
 from pipelines.captures.magic import (
     HEAD_BYTES,
     foreign_image,
@@ -29,29 +30,20 @@ from pipelines.captures.magic import (
 )
 from pipelines.errors import CaptureError
 
-__all__ = ["KINDS", "ArchiveLimits", "Layout", "Sniffed", "layout_of", "sniff"]
-
-KINDS = ("video", "images", "nerfstudio", "polycam", "record3d")
 _ACCEPTED = "Send a video (MP4, MOV, MKV, WebM, AVI), a .zip of photos, or a .zip of an app export."
 
 
 @dataclass(frozen=True)
 class Sniffed:
-    """What a file is. kind: one of `KINDS`. details: small JSON-able facts."""
+    """What a file is.
 
-    kind: str
-    details: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Which kind of capture an archive holds, and the folder in it where that starts.
-
-    root: "" or a folder's name ending with "/".
+    kind: one of `catalogue.KINDS`. claim: where in it the capture starts, and why it is of that
+    kind. details: small JSON-able facts.
     """
 
     kind: str
-    root: str
+    claim: Claim
+    details: dict[str, Any] = field(default_factory=dict)
 
 
 def sniff(path: Path, filename: str, limits: ArchiveLimits | None = None) -> Sniffed:
@@ -66,12 +58,13 @@ def sniff(path: Path, filename: str, limits: ArchiveLimits | None = None) -> Sni
         raise CaptureError(
             "The file is empty.", code="empty_file", hint="Check the file and send it again."
         )
-    container = video_container(head)
-    if container:
-        return Sniffed("video", {"container": container})
     if is_zip(head):
         return _sniff_zip(path, limits or ArchiveLimits())
-    raise _unknown(head, filename)
+    found = claimed(Listing({"": head}, is_archive=False))
+    if found is None:
+        raise _unknown(head, filename)
+    importer, claim = found
+    return Sniffed(importer.kind, claim, {"container": video_container(head)})
 
 
 def _unknown(head: bytes, filename: str) -> CaptureError:
@@ -99,51 +92,25 @@ def _sniff_zip(path: Path, limits: ArchiveLimits) -> Sniffed:
     with open_archive(path) as archive:
         entries = checked_entries(archive, limits)
         heads = {name: head_of(archive, info) for name, info in entries.items()}
-    images = [name for name, head in heads.items() if image_format(head)]
-    layout = layout_of(entries, images)
-    if not images:
+    listing = Listing(heads)
+    found = claimed(listing)
+    if found is None:
         raise _no_images(heads)
+    importer, claim = found
     return Sniffed(
-        layout.kind,
+        importer.kind,
+        claim,
         {
-            "num_images": len(images),
+            "num_images": len(listing.pictures),
             "num_entries": len(entries),
             "unpacked_bytes": sum(info.file_size for info in entries.values()),
-            "root": layout.root,
+            "root": claim.root,
+            "recognised_by": claim.why,
         },
     )
 
 
-def layout_of(names: Iterable[str], images: Iterable[str]) -> Layout:
-    """The kind of an archive by the names in it. images: those that are pictures by content."""
-    known = set(names)
-    pictures = set(images)
-    by_depth = sorted(known, key=lambda name: (name.count("/"), name))
-    for name in by_depth:
-        folder, _, base = name.rpartition("/")
-        root = folder + "/" if folder else ""
-        if base == "transforms.json":
-            return Layout("nerfstudio", root)
-        if base == "metadata.json" and _any_below(pictures, root + "rgb/"):
-            return Layout("record3d", root)
-        if base == "metadata" and _any_below(pictures, root + "rgbd/"):
-            return Layout("record3d", root)
-    for name in by_depth:
-        before, mark, _ = ("/" + name).partition("/keyframes/")
-        root = (before + "/").lstrip("/")
-        if mark and any(
-            _any_below(pictures, f"{root}keyframes/{folder}/")
-            for folder in ("corrected_images", "images")
-        ):
-            return Layout("polycam", root)
-    return Layout("images", "")
-
-
-def _any_below(names: set[str], folder: str) -> bool:
-    return any(name.startswith(folder) for name in names)
-
-
-def _no_images(heads: dict[str, bytes]) -> CaptureError:
+def _no_images(heads: Mapping[str, bytes]) -> CaptureError:
     foreign = sorted({kind for head in heads.values() if (kind := foreign_image(head))})
     videos = sum(video_container(head) is not None for head in heads.values())
     hint = "Put the photos (JPEG, PNG or WebP) into the .zip."

@@ -2,23 +2,27 @@
 
 `extractall` is never used: entries are streamed to paths that we choose, and what comes out is
 counted against what the directory declared and against the limit for the whole archive.
+
+The archive also keeps account: who reads an entry uses it, who decides against one says why
+(`set_aside`), and `unused` is what is left, for `pipelines.captures.leftovers`.
 """
 
 from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import IO, Any
 
 from pipelines.captures.archive_rules import (
-    READ_ERRORS,
     ArchiveLimits,
     checked_entries,
     damaged,
     head_of,
     open_archive,
+    reading,
     shown,
 )
 from pipelines.captures.magic import image_format
@@ -37,12 +41,14 @@ class CaptureArchive:
     def __init__(self, path: Path, limits: ArchiveLimits) -> None:
         self._limits = limits
         self._unpacked_bytes = 0
+        self._counted: dict[str, int] = {}
+        self._used: set[str] = set()
+        self._set_aside: dict[str, str] = {}
         self._zip = open_archive(path)
         try:
             self._entries = checked_entries(self._zip, limits)
-            self._formats = {
-                name: image_format(head_of(self._zip, info)) for name, info in self._entries.items()
-            }
+            self._heads = {name: head_of(self._zip, info) for name, info in self._entries.items()}
+            self._formats = {name: image_format(head) for name, head in self._heads.items()}
         except BaseException:
             self._zip.close()
             raise
@@ -75,24 +81,60 @@ class CaptureArchive:
             raise KeyError(name)
         return kind
 
+    def num_bytes(self, name: str) -> int:
+        """How many bytes an entry has, unpacked, as the archive declares it."""
+        return self._entries[name].file_size
+
+    def checksum(self, name: str) -> int:
+        """The CRC-32 of an entry, as the archive declares it."""
+        return self._entries[name].CRC
+
+    def head(self, name: str) -> bytes:
+        """The first bytes of an entry, `magic.HEAD_BYTES` at most."""
+        return self._heads[name]
+
+    def set_aside(self, names: Iterable[str], why: str) -> None:
+        """Say why entries are not used: the end of "were not used: ...". The first reason stays."""
+        for name in names:
+            self._set_aside.setdefault(name, why)
+
+    def told(self, names: Iterable[str]) -> None:
+        """Say that a warning of its own tells why entries are not used."""
+        self._used.update(names)
+
+    @property
+    def unused(self) -> dict[str, str]:
+        """Entries that nobody has read or told of so far, and why, "" where nobody said."""
+        return {
+            name: self._set_aside.get(name, "") for name in self._entries if name not in self._used
+        }
+
     def extract(self, name: str, target: Path) -> None:
-        """Write one entry to `target`.
+        """Write one entry to `target`; it counts as used.
 
         Raises CaptureError: archive_bomb where it holds more than it declared or than is allowed,
         archive_damaged. `target` may then be incomplete.
         """
         info = self._entries[name]
+        self._used.add(name)
         written = 0
-        try:
-            with self._zip.open(info) as source, target.open("wb") as sink:
-                while chunk := source.read(_CHUNK_BYTES):
-                    written += len(chunk)
-                    self._count(len(chunk), written, info)
-                    sink.write(chunk)
-        except READ_ERRORS as error:
-            raise damaged() from error
+        with reading():
+            source = self._zip.open(info)
+        with source, target.open("wb") as sink:
+            while chunk := self._chunk(source):
+                written += len(chunk)
+                self._count(written, info)
+                sink.write(chunk)
         if written != info.file_size:
             raise damaged()
+
+    def peek(self, name: str, max_bytes: int) -> bytes:
+        """An entry's first bytes, only to look at: it does not count as used. Raises as `read`."""
+        info = self._entries[name]
+        with reading(), self._zip.open(info) as source:
+            data = source.read(max_bytes)
+        self._count(len(data), info)
+        return data
 
     def read(self, name: str, max_bytes: int = MAX_JSON_BYTES) -> bytes:
         """One small entry as bytes. Raises CaptureError as `extract`, and too_large."""
@@ -104,13 +146,8 @@ class CaptureArchive:
                 code="too_large",
                 hint="Export the capture again, with fewer frames.",
             )
-        try:
-            with self._zip.open(info) as source:
-                data = source.read(max_bytes + 1)
-        except READ_ERRORS as error:
-            raise damaged() from error
-        self._count(len(data), len(data), info)
-        return data
+        self._used.add(name)
+        return self.peek(name, max_bytes + 1)
 
     def read_json(self, name: str) -> Any:
         """One entry as JSON. Raises CaptureError poses_malformed where it is none."""
@@ -123,12 +160,18 @@ class CaptureArchive:
                 hint="Export the capture again from the app.",
             ) from error
 
-    def _count(self, fresh: int, written: int, info: zipfile.ZipInfo) -> None:
-        self._unpacked_bytes += fresh
-        if written > info.file_size or self._unpacked_bytes > self._limits.max_unpacked_bytes:
+    def _chunk(self, source: IO[bytes]) -> bytes:
+        with reading():
+            return source.read(_CHUNK_BYTES)
+
+    def _count(self, unpacked: int, info: zipfile.ZipInfo) -> None:
+        """Add what was unpacked of an entry, from its start, to the sum; twice counts once."""
+        name = info.filename
+        self._unpacked_bytes += max(0, unpacked - self._counted.get(name, 0))
+        self._counted[name] = max(unpacked, self._counted.get(name, 0))
+        if unpacked > info.file_size or self._unpacked_bytes > self._limits.max_unpacked_bytes:
             raise CaptureError(
-                f"The archive holds more than it declares, or than is allowed, at "
-                f'"{shown(info.filename)}".',
+                f'The archive holds more than it declares, or than is allowed, at "{shown(name)}".',
                 code="archive_bomb",
                 hint="Send an archive of photos, or of an app's export, and nothing else.",
             )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import re
-import threading
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 import PIL.Image
 
+from pipelines.captures.hdr import TRANSFERS, sdr_filters, write_pq_table
 from pipelines.errors import ToolError
 from pipelines.stage import StageContext
-from pipelines.tools.ffmpeg import has_filter, passthrough_timing, run_ffmpeg, untrusted_input
+from pipelines.tools.ffmpeg import passthrough_timing, run_ffmpeg, untrusted_input
 
 Plane = npt.NDArray[np.uint8]
 
@@ -27,7 +28,6 @@ SHARPNESS_SIDE_PX = 960
 """Sharpness is measured at about this long side: below it noise counts less than blur."""
 
 _TIMES_WAIT_S = 60.0
-_HDR_TRANSFER = {"hlg": "arib-std-b67", "pq": "smpte2084"}
 
 
 @dataclass(frozen=True)
@@ -73,20 +73,17 @@ class Frame:
 class DecodePlan:
     """What is decoded.
 
-    width, height: of the upright, reduced frames. hdr: as in `VideoInfo`.
+    width, height: of the upright, reduced frames. hdr: as in `VideoInfo`. matrix: ffmpeg's name of
+    the colour matrix to assume, or None for the one that the video names.
     step_s: at most one frame is delivered per cell of this length (from `start_s` on); 0 for all.
     """
 
     width: int
     height: int
     hdr: str = "none"
+    matrix: str | None = None
     start_s: float = 0.0
     step_s: float = 0.0
-
-
-def can_tone_map() -> bool:
-    """Whether this ffmpeg can turn HDR into SDR."""
-    return has_filter("zscale") and has_filter("tonemap")
 
 
 def reduced_size(width: int, height: int, long_side_px: int) -> tuple[int, int]:
@@ -95,56 +92,72 @@ def reduced_size(width: int, height: int, long_side_px: int) -> tuple[int, int]:
     return max(2, round(width * scale)), max(2, round(height * scale))
 
 
-def filter_chain(plan: DecodePlan) -> str:
-    """The ffmpeg filters of a plan; ffmpeg itself puts the rotation in front of them."""
+def filter_chain(plan: DecodePlan, pq_table: Path | None = None) -> str:
+    """The ffmpeg filters of a plan; ffmpeg itself puts the rotation in front of them.
+
+    pq_table: see `hdr.sdr_filters`.
+    """
     parts = ["showinfo@all=checksum=0"]
     if plan.step_s > 0:
         cell = f"floor(({{}}-{plan.start_s:.9f})/{plan.step_s:.9f})"
         condition = f"gt({cell.format('t')},{cell.format('prev_selected_t')})"
         parts.append(f"select='isnan(prev_selected_t)+{condition}'")
     parts.append("showinfo@kept=checksum=0")
+    if plan.matrix is not None:
+        parts.append(f"setparams=colorspace={plan.matrix}")
     parts.append(f"scale={plan.width}:{plan.height}:flags=bicubic+accurate_rnd")
-    if plan.hdr in _HDR_TRANSFER and can_tone_map():
-        # npl: brightness of SDR white in the HDR signal, 203 cd/m2 (ITU-R BT.2408).
-        # Some phones tag the transfer alone; zscale finds no way where the rest is unknown.
-        tags = f"colorspace=bt2020nc:color_primaries=bt2020:color_trc={_HDR_TRANSFER[plan.hdr]}"
-        parts.append(f"setparams={tags},zscale=t=linear:npl=203,format=gbrpf32le")
-        parts.append("zscale=p=bt709,tonemap=mobius:param=0.7:desat=0")
-        parts.append("zscale=t=iec61966-2-1:m=170m:r=full,format=yuv420p")
-    else:
-        parts.append("scale=out_color_matrix=bt601:out_range=full,format=yuv420p")
+    if plan.hdr in TRANSFERS:
+        parts += sdr_filters(plan.hdr, pq_table)
+    parts.append("scale=out_color_matrix=bt601:out_range=full,format=yuv420p")
     return ",".join(parts)
 
 
-class _Times:
-    """Reads the time of each delivered frame from what `showinfo` writes to stderr."""
+class FrameTimes:
+    """Reads the time of each delivered frame from what `showinfo` writes to stderr.
 
-    _CONFIG = re.compile(r"\[showinfo@all @ [^\]]*\] config in time_base: (\d+)/(\d+)")
-    _FRAME = re.compile(r"\[showinfo@(all|kept) @ [^\]]*\] n: *(\d+) pts: *(-?\d+|NOPTS)")
+    ffmpeg leaves out the `[showinfo@... ]` in front where another message did not end its line, so
+    lines are known by their content then: all frames are counted before some are kept, so that a
+    frame with the next number is one of all.
+    """
+
+    _CONFIG = re.compile(r"config in time_base: (\d+)/(\d+)")
+    _FRAME = re.compile(
+        r"(?:\[showinfo@(?P<which>all|kept) @ [^\]]*\] )?"
+        r"\bn: *(?P<number>\d+) pts: *(?P<pts>-?\d+|NOPTS) +pts_time: *(?P<seconds>\S+)"
+    )
 
     def __init__(self) -> None:
         self.kept: queue.Queue[tuple[int, float]] = queue.Queue()
         self.num_decoded = 0
-        self._unit_s = 0.0
+        self._unit_s: float | None = None
         self._indices: dict[str, int] = {}
-        self.ended = threading.Event()
 
     def on_line(self, line: str) -> None:
-        config = self._CONFIG.match(line)
-        if config:
+        """Take the next line of the log."""
+        if line.startswith(" "):
+            return  # what the file says of itself, and it may say anything
+        config = self._CONFIG.search(line)
+        if config and int(config.group(2)) > 0:
             self._unit_s = int(config.group(1)) / int(config.group(2))
-        frame = self._FRAME.match(line)
+        frame = self._FRAME.search(line)
         if not frame:
             return
-        which, number, pts = frame.groups()
+        number, pts = int(frame["number"]), frame["pts"]
+        which = frame["which"] or ("all" if number == self.num_decoded else "kept")
         if which == "all":
-            self.num_decoded = int(number) + 1
-            self._indices[pts] = int(number)
+            self.num_decoded = number + 1
+            self._indices[pts] = number
             return
-        index = self._indices[pts]
+        index = self._indices.get(pts, max(self.num_decoded - 1, 0))
         self._indices.clear()
-        # Without a time of its own a frame has at least its place in the order.
-        self.kept.put((index, float("nan") if pts == "NOPTS" else int(pts) * self._unit_s))
+        self.kept.put((index, self._time_s(pts, frame["seconds"])))
+
+    def _time_s(self, pts: str, seconds: str) -> float:
+        """Without a time of its own (nan) a frame has at least its place in the order."""
+        if pts == "NOPTS":
+            return float("nan")
+        # ffmpeg rounds what it says in seconds to six digits: used where the unit is not known.
+        return float(seconds) if self._unit_s is None else int(pts) * self._unit_s
 
 
 def decode(
@@ -155,7 +168,7 @@ def decode(
     Returns how many frames were decoded, also those that were not delivered. A frame's planes are
     its own and may be kept. Raises ToolError and Cancelled, and what `on_frame` raises.
     """
-    times = _Times()
+    times = FrameTimes()
     width, height = plan.width, plan.height
     half_w, half_h = (width + 1) // 2, (height + 1) // 2
     frame_bytes = width * height + 2 * half_w * half_h
@@ -181,20 +194,24 @@ def decode(
                 )
             )
 
-    stream = untrusted_input(path).output(
-        "pipe:1",
-        map="0:V:0",
-        f="rawvideo",
-        vf=filter_chain(plan),
-        **passthrough_timing(),
-        **{"an": None, "sn": None, "dn": None},
-    )
-    run_ffmpeg(
-        stream,
-        log_level="info",
-        time_limit_s=float("inf"),
-        is_cancelled=ctx.is_cancelled,
-        on_line=times.on_line,
-        on_stdout=on_stdout,
-    )
+    with tempfile.TemporaryDirectory(prefix="frames-") as scratch:
+        pq_table = Path(scratch) / "pq.cube"
+        if plan.hdr == "pq":
+            write_pq_table(pq_table)
+        stream = untrusted_input(path).output(
+            "pipe:1",
+            map="0:V:0",
+            f="rawvideo",
+            vf=filter_chain(plan, pq_table),
+            **passthrough_timing(),
+            **{"an": None, "sn": None, "dn": None},
+        )
+        run_ffmpeg(
+            stream,
+            log_level="info",
+            time_limit_s=float("inf"),
+            is_cancelled=ctx.is_cancelled,
+            on_line=times.on_line,
+            on_stdout=on_stdout,
+        )
     return times.num_decoded

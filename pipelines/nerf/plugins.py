@@ -28,8 +28,8 @@ COMPONENT_KINDS = ("contraction", "spacing", "position_encoding", "direction_enc
 class Method:
     """A way to learn a scene: what `train.method` chooses.
 
-    config: a frozen dataclass derived from `config.ModelConfig`, every field made by
-        `config.option`.
+    config: a frozen dataclass derived from `options.parts.ModelConfig`, every field made by
+        `options.parts.option`.
     model: "module:class" of the `models.base.Model`, built as `class(config, num_train_images)`;
         imported when first built.
     train: what the method wants other than `TrainConfig` has it, as nested plain values.

@@ -1,9 +1,9 @@
 """A trained model and a camera -> pictures, in tiles of bounded memory.
 
 Where they know the model, the whole forward pass runs in a compiled kernel on the CPU
-(`kernels.render_rays`) and in large tiles on a GPU (`gpu.render`); elsewhere, or with engine
-"plain", the model itself is asked in chunks. Depths are distances along the ray in world units, not
-z. Symbols: R rays, H and W of a picture.
+(`engines.cpu.render.rays`) and in large tiles on a GPU (`engines.gpu.render`); elsewhere, or with
+engine "plain", the model itself is asked in chunks. Depths are distances along the ray in world
+units, not z. Symbols: R rays, H and W of a picture.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.nerf.cameras import Cameras, SceneTransform
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Appearance, Model
 from pipelines.nerf.models.nerfacto import Nerfacto
-from pipelines.nerf.rays import Rays
-from pipelines.nerf.render_config import RenderConfig
+from pipelines.nerf.options.render import RenderConfig
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
+from pipelines.nerf.space.rays import Rays
 
 if TYPE_CHECKING:
-    from pipelines.nerf.kernels.render_grid import BakedGrid
+    from pipelines.nerf.engines.cpu.render.baked_grid import BakedGrid
 
 FloatArray = NDArray[np.float32]
 Drawer = Callable[[Rays], dict[str, FloatArray]]
@@ -65,10 +65,12 @@ class RenderedImage:
 
 
 class Renderer:
-    """Renders a model that others may go on training: its state is read anew in every call.
+    """Renders a model that others may go on training: its state is read anew in every call, and
+    left as it was.
 
     model: is moved to `device` where one is given. scene: gives the world's unit.
-    engine: "fast" is the compiled kernel on the CPU, `gpu.render` on a GPU; "plain" the model in
+    engine: "fast" is the compiled kernel on the CPU, `engines.gpu.render` on a GPU; "plain" the
+        model in
         PyTorch; "auto" is fast where that knows the model and, on a GPU, agrees with it.
     config: what the fast engine may leave out; with `ALL_SAMPLES` it agrees with the plain one to
         rounding.
@@ -107,8 +109,8 @@ class Renderer:
                 "Use engine auto.",
             )
         self.engine = "fast" if is_fast else "plain"
-        if engine != "plain" and on_cpu and not is_fast:
-            model.set_engine("fast")  # its grids, where the whole model has no kernel
+        # What the model itself renders with: where it has no kernel as a whole, its parts may.
+        self._model_engine = engine if engine == "plain" else "fast" if on_cpu else None
 
     def render(
         self,
@@ -176,8 +178,9 @@ class Renderer:
         """`rays_of(begin, end)` makes the rays of one tile."""
         result: dict[str, FloatArray] = {}
         tile, draw = self._drawer(appearance)
-        was_training = self._model.training
+        was_training, engine = self._model.training, self._model.engine
         self._model.eval()
+        self._model.set_engine(self._model_engine or engine)
         try:
             with torch.no_grad():
                 for begin in range(0, num_rays, tile):
@@ -190,6 +193,7 @@ class Renderer:
                         progress(end / num_rays)
         finally:
             self._model.train(was_training)
+            self._model.set_engine(engine)
         to_world = np.float32(1.0 / self._scene.scale)
         for name in ("depth", "expected_depth"):
             result[name] *= to_world
@@ -217,8 +221,8 @@ class Renderer:
 
     def _cpu_drawer(self, appearance: Appearance) -> tuple[int, Drawer]:
         # Imported here: a machine that only renders on a GPU never loads the compiler.
-        from pipelines.nerf.kernels.render_grid import BakedGrid
-        from pipelines.nerf.kernels.render_rays import pack_model, render_rays
+        from pipelines.nerf.engines.cpu.render.baked_grid import BakedGrid
+        from pipelines.nerf.engines.cpu.render.rays import pack_model, render_rays
 
         if self._baked is None:
             self._baked = BakedGrid()
@@ -234,7 +238,7 @@ class Renderer:
 
     def _gpu_drawer(self, appearance: Appearance) -> tuple[int, Drawer]:
         # Imported here: only this engine wants it.
-        from pipelines.nerf.gpu.render import TileDrawer
+        from pipelines.nerf.engines.gpu.render import TileDrawer
 
         assert isinstance(self._model, Nerfacto)
         drawer = TileDrawer(
@@ -272,17 +276,17 @@ def pixels_in_blocks(width: int, height: int, side: int) -> Tensor:
 def _fast_engine_knows(model: Model, on_cpu: bool) -> bool:
     # Imported here: a machine that only renders on a GPU never loads the compiler.
     if on_cpu:
-        from pipelines.nerf.kernels.render_rays import supports
+        from pipelines.nerf.engines.cpu.render.rays import supports
 
         return supports(model)
-    from pipelines.nerf.gpu.render import can_draw
+    from pipelines.nerf.engines.gpu.render import can_draw
 
     return can_draw(model)
 
 
 def _draws_right(model: Model) -> bool:
     # Imported here: a machine without a GPU needs no Triton.
-    from pipelines.nerf.gpu.self_check import picture_problem
+    from pipelines.nerf.engines.gpu.self_check import picture_problem
 
     assert isinstance(model, Nerfacto)
     return picture_problem(model) is None

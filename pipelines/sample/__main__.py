@@ -1,4 +1,4 @@
-"""`python -m pipelines.sample OUT.mp4`: film the sample capture, and write its true cameras."""
+"""`python -m pipelines.sample OUT.mp4 [--scene NAME]`: film an analytic scene, keep the truth."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pipelines.errors import PipelineError
 from pipelines.sample.film import LONG_SIDE_PX, NUM_FRAMES, film_capture
+from pipelines.sample.scenes.catalogue import TAKES
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -20,6 +21,9 @@ def main(arguments: list[str] | None = None) -> int:
         description="Film an analytic scene as a phone would: a capture whose truth is known.",
     )
     parser.add_argument("out", type=Path, help="the .mp4 to write")
+    parser.add_argument(
+        "--scene", choices=sorted(TAKES), default="bowl", help="what is filmed; %(default)s"
+    )
     parser.add_argument("--frames", type=int, default=NUM_FRAMES, help="number of frames")
     parser.add_argument(
         "--long-side", type=int, default=LONG_SIDE_PX, metavar="PX", help="of the upright picture"
@@ -38,6 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
                 given.out,
                 given.frames,
                 given.long_side,
+                take=TAKES[given.scene],
                 on_frame=lambda done, total: bar.update(task, completed=done, total=total),
             )
         if given.truth is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.orientation import Similarity
+from pipelines.scene.orientation import Similarity
 
 Floats = NDArray[np.float64]
 

@@ -1,9 +1,9 @@
-"""Films the analytic scene as a phone would, and keeps the exact cameras.
+"""Films an analytic scene as a phone would, and keeps the exact cameras.
 
 The phone is held upright: its sensor lies sideways, so the pictures are stored in landscape with a
 rotation flag, and players turn them by 90 degrees clockwise. Cameras refer to the **upright**
 picture. World frame and units are those of `pipelines.sample.scene`; poses are world_from_camera,
-OpenGL axes.
+OpenGL axes. The sample's take is filmed where none is named.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ import ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.errors import ToolError
-from pipelines.sample.scene import SCENE_SIZE_M, Floats, pose_matrix, render
+from pipelines.sample.scene import SAMPLE, Floats, pose_matrix, render
+from pipelines.sample.takes import Take, looking_at, sway
+from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.tools.ffmpeg import ffmpeg_executable
 
 FRAME_RATE = 30.0
@@ -61,12 +62,6 @@ def phone_camera(long_side_px: int = LONG_SIDE_PX) -> Intrinsics:
     )
 
 
-def _sway(time: float, seed: float, *periods: float) -> float:
-    """A smooth unsteadiness in [-1, 1]: a few sines whose periods do not match."""
-    waves = [math.sin(2 * math.pi * time / p + seed * (i + 1)) for i, p in enumerate(periods)]
-    return sum(waves) / len(waves)
-
-
 def hand_held_pose(progress: float) -> Floats:
     """world_from_camera [3, 4] at a point of the walk, progress in [0, 1].
 
@@ -79,25 +74,25 @@ def hand_held_pose(progress: float) -> Floats:
     height = _HEIGHT_M + 0.26 * math.sin(2 * math.pi * 1.15 * progress - 0.9)
     eye = np.array([radius * math.cos(azimuth), radius * math.sin(azimuth), height])
     time = progress * 4.0  # seconds of a walk at its usual pace
-    eye += 0.012 * np.array([_sway(time, s, 0.9, 0.53, 0.37) for s in (1.0, 2.0, 3.0)])
-    target = _TARGET + np.array([0.06 * _sway(time, s, 1.7, 0.83, 0.41) for s in (4.0, 5.0, 6.0)])
-    roll = math.radians(2.5 * _sway(time, 7.0, 1.9, 0.71))
-    forward = target - eye
-    forward /= np.linalg.norm(forward)
-    level = np.cross(forward, [0.0, 0.0, 1.0])
-    level /= np.linalg.norm(level)
-    above = np.cross(level, forward)
-    right = math.cos(roll) * level + math.sin(roll) * above
-    return np.stack([right, np.cross(right, forward), -forward, eye], axis=1)
+    eye += 0.012 * np.array([sway(time, s, 0.9, 0.53, 0.37) for s in (1.0, 2.0, 3.0)])
+    target = _TARGET + np.array([0.06 * sway(time, s, 1.7, 0.83, 0.41) for s in (4.0, 5.0, 6.0)])
+    roll = math.radians(2.5 * sway(time, 7.0, 1.9, 0.71))
+    return looking_at(eye, target, roll)
+
+
+SAMPLE_TAKE = Take(SAMPLE, hand_held_pose)
 
 
 def walk(
     num_frames: int = NUM_FRAMES,
     camera: Intrinsics | None = None,
     frame_rate: float = FRAME_RATE,
+    take: Take = SAMPLE_TAKE,
 ) -> CamerasFile:
     """The true cameras of a film of that many frames; image i is at i / frame_rate seconds.
 
+    The notes hold the scene's name and size, the angle around the vertical axis through the origin
+    that the camera covers, and each frame's exposure gain.
     Raises ValueError for fewer than 2 frames.
     """
     if num_frames < 2:
@@ -107,33 +102,43 @@ def walk(
             file=f"frame_{index:05d}",
             camera=0,
             world_from_camera=tuple(
-                tuple(map(float, row)) for row in hand_held_pose(index / (num_frames - 1))
+                tuple(map(float, row)) for row in take.pose(index / (num_frames - 1))
             ),
             timestamp_s=index / frame_rate,
         )
         for index in range(num_frames)
     )
+    arc_deg = arc_degrees(np.array([pose_matrix(image)[:, 3] for image in images]))
     return CamerasFile(
         cameras=(camera or phone_camera(),),
         images=images,
         metric=True,
         source="sample",
-        notes={"scene_size_m": SCENE_SIZE_M, "frame_rate": frame_rate, "arc_deg": ARC_DEG},
+        notes={
+            "scene": take.scene.name,
+            "scene_size_m": take.scene.subject.size,
+            "frame_rate": frame_rate,
+            "arc_deg": round(arc_deg, 2),
+            "gains": [take.gain(index / (num_frames - 1)) for index in range(num_frames)],
+        },
     )
 
 
-def render_all(cameras: CamerasFile, num_threads: int | None = None) -> Iterator[Picture]:
-    """The pictures of all images in order, uint8 [H, W, 3], rendered on threads just ahead of use.
+def render_all(
+    cameras: CamerasFile, num_threads: int | None = None, take: Take = SAMPLE_TAKE
+) -> Iterator[Picture]:
+    """The pictures of a walk in order, uint8 [H, W, 3], rendered on threads just ahead of use.
 
-    num_threads: one per processor where not given.
+    cameras: of `walk` through that take. num_threads: one per processor where not given.
     """
     workers = num_threads or cpu_count() or 1
     waiting: deque[Future[Picture]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         try:
-            for image in cameras.images:
+            for image, gain in zip(cameras.images, cameras.notes["gains"], strict=True):
                 camera = cameras.cameras[image.camera]
-                waiting.append(pool.submit(render, camera, pose_matrix(image)))
+                pose = pose_matrix(image)
+                waiting.append(pool.submit(render, camera, pose, take.scene, gain))
                 if len(waiting) > 2 * workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -150,13 +155,14 @@ def film_capture(
     *,
     on_frame: OnFrame | None = None,
     num_threads: int | None = None,
+    take: Take = SAMPLE_TAKE,
 ) -> CamerasFile:
-    """Film the scene into an H.264 MP4 as a phone writes it: sideways, with a rotation flag.
+    """Film a take into an H.264 MP4 as a phone writes it: sideways, with a rotation flag.
 
     path: the .mp4 to write. long_side_px: of the upright picture. Returns the true cameras; frame
     i of the file is image i. Raises ToolError where ffmpeg fails.
     """
-    truth = walk(num_frames, phone_camera(long_side_px))
+    truth = walk(num_frames, phone_camera(long_side_px), take=take)
     options: dict[str, str | int] = {
         "c:v": "libx264",
         "preset": "veryfast",
@@ -167,7 +173,7 @@ def film_capture(
         "format=yuv420p,"
         "setparams=range=tv:color_primaries=bt709:color_trc=bt709:colorspace=bt709",
     }
-    encode_sideways(path, render_all(truth, num_threads), truth, options, on_frame)
+    encode_sideways(path, render_all(truth, num_threads, take), truth, options, on_frame)
     return truth
 
 

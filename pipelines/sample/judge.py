@@ -1,7 +1,8 @@
-"""How far poses and a mesh made from the sample are from the truth.
+"""How far poses and a mesh made from an analytic scene are from the truth.
 
 Poses are aligned to the true cameras by a similarity of the camera centres; the mesh is moved by
-that same similarity and nothing else, so a wrong scale or a tilt shows.
+that same similarity and nothing else, so a wrong scale or a tilt shows. Only what cameras saw
+counts: no mesh can have what was never in a picture.
 """
 
 from __future__ import annotations
@@ -12,10 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.cameras_file import CamerasFile, PosedImage
-from pipelines.orientation import Similarity
 from pipelines.sample.align import Floats, path_extent, similarity
-from pipelines.sample.scene import SUBJECT, Region, pose_matrix, seen_surface, surface_distance
+from pipelines.sample.scene import (
+    SAMPLE,
+    SUBJECT,
+    Region,
+    Scene,
+    pose_matrix,
+    seen_surface,
+    surface_distance,
+)
+from pipelines.scene.cameras_file import CamerasFile, PosedImage
+from pipelines.scene.orientation import Similarity
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,32 @@ class MeshJudgement:
     completeness: float
     num_mesh_points: int
     num_true_points: int
+
+
+@dataclass(frozen=True)
+class SurfaceScores:
+    """Shares of a surface within a tolerance of the other, keyed by the tolerance, a part of the
+    scene's size.
+
+    precision: of the mesh by area, how much lies that near to the true surface. recall: of the true
+    surface that cameras saw, evenly by area, how much has the mesh that near. f_score: their
+    harmonic mean. things_precision, things_recall: the same of things alone, without floor and
+    walls. accuracy, completeness: medians of the two distances, relative to the size.
+    Source: Knapitsch et al., "Tanks and Temples", ACM TOG 36(4), 2017, section 3.
+    """
+
+    precision: dict[float, float]
+    recall: dict[float, float]
+    f_score: dict[float, float]
+    things_precision: dict[float, float]
+    things_recall: dict[float, float]
+    accuracy: float
+    completeness: float
+
+
+TOLERANCES = (0.01, 0.02)
+"""1 and 2 % of the scene's size."""
+_RAYS_PER_POINT = 4
 
 
 def judge_poses(cameras: CamerasFile, truth: CamerasFile) -> PosesJudgement:
@@ -116,6 +151,64 @@ def judge_mesh(
         num_mesh_points=len(points),
         num_true_points=len(true_points),
     )
+
+
+def judge_surface(
+    vertices: Floats,
+    faces: NDArray[np.integer],
+    alignment: Similarity,
+    truth: CamerasFile,
+    scene: Scene = SAMPLE,
+    num_points: int = 40_000,
+) -> SurfaceScores:
+    """Precision, recall and F-score of a mesh at `TOLERANCES`, within the scene's subject.
+
+    Arguments as of `judge_mesh`. A mesh without faces scores 0 with infinite distances.
+    """
+    size, region = scene.subject.size, scene.subject
+    seen = seen_surface(truth, region, _RAYS_PER_POINT * num_points, scene)
+    true_points = _thinned(seen, 0.5 * TOLERANCES[0] * size)
+    moved = alignment.apply_to_points(np.asarray(vertices, dtype=np.float64))
+    points, off = np.zeros((0, 3)), np.zeros(0)
+    missing = np.full(len(true_points), np.inf)
+    if len(faces):
+        points = _points_on_mesh(moved, faces, num_points)
+        points = points[region.grown(scene.beyond).contains(points)]
+        points = points[_in_view(points, truth)]
+        off = surface_distance(points, scene)
+        missing = _distance_to_mesh(true_points, moved, faces)
+    things, true_things = scene.things.contains(points), scene.things.contains(true_points)
+    precision, recall = _shares(off, size), _shares(missing, size)
+    return SurfaceScores(
+        precision=precision,
+        recall=recall,
+        f_score={
+            tolerance: 2
+            * precision[tolerance]
+            * recall[tolerance]
+            / max(precision[tolerance] + recall[tolerance], 1e-12)
+            for tolerance in TOLERANCES
+        },
+        things_precision=_shares(off[things], size),
+        things_recall=_shares(missing[true_things], size),
+        accuracy=float(np.median(off)) / size if len(off) else np.inf,
+        completeness=float(np.median(missing)) / size,
+    )
+
+
+def _shares(distances: Floats, size: float) -> dict[float, float]:
+    """By tolerance, the share of distances [N] that are within it; 0 where there are none."""
+    return {
+        tolerance: float((distances <= tolerance * size).mean()) if len(distances) else 0.0
+        for tolerance in TOLERANCES
+    }
+
+
+def _thinned(points: Floats, side: float) -> Floats:
+    """One of the points [N, 3] in each cube of that side: about evenly spread by area."""
+    _, first = np.unique(np.floor(points / side).astype(np.int64), axis=0, return_index=True)
+    kept: Floats = points[np.sort(first)]
+    return kept
 
 
 def _points_on_mesh(vertices: Floats, faces: NDArray[np.integer], num_points: int) -> Floats:

@@ -1,21 +1,23 @@
-"""The analytic scene: a bowl among things at three depths in a painted room.
+"""Analytic scenes, and the sample's: a bowl among things at three depths in a painted room.
 
 Everything is known exactly: where a ray hits, in which colour, and how far a point lies from the
-nearest surface. World frame: right-handed, +Z up, metres, the floor is z = 0, the subject stands
-around the origin. `SUBJECT` is the part that the sample's cameras circle around and that meshes are
-judged on; `SCENE_SIZE_M`, its longest side, is the size that tolerances refer to.
+nearest surface. World frame: right-handed, +Z up, metres, the floor is z = 0. Of the sample the
+subject stands around the origin; `SUBJECT` is the part that its cameras circle around and that
+meshes are judged on; `SCENE_SIZE_M`, its longest side, is the size that tolerances refer to. Other
+scenes are in `pipelines.sample.scenes`; functions take the sample where none is named.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.sample import tracing
+from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 
 Floats = NDArray[np.float64]
 
@@ -31,6 +33,14 @@ class Region:
     def size(self) -> float:
         """The longest side, metres."""
         return max(b - a for a, b in zip(self.low, self.high, strict=True))
+
+    def grown(self, by: float) -> Region:
+        """The box with all sides moved outwards, metres."""
+        low, high = (
+            tuple(s + sign * by for s in side)
+            for side, sign in ((self.low, -1.0), (self.high, 1.0))
+        )
+        return Region((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """points [N, 3] -> [N]."""
@@ -56,8 +66,11 @@ class Primitive:
 
     room and box: three half sides. sphere: radius. cylinder: radius and half height. bowl: outer
     and inner radius of a shell whose lower half is kept, open upwards, `center` amid its rim.
-    yaw_deg: turned about +Z. patch: size of the colour patches, metres. palette: row of PALETTES;
-    the bowl's inside and the room's walls take the row after it.
+    torus: radius of an upright ring around its y axis and of its tube. yaw_deg: turned about +Z.
+    patch: size of the colour patches, metres. palette: row of the scene's palettes; the bowl's
+    inside and the room's walls take the row after it. detail: strength of the fine paint, of a
+    room that of its walls. gloss: share of light mirrored when looked at squarely. glow: brightness
+    of what the lamp does not light, 0 for what it does.
     """
 
     kind: int
@@ -66,12 +79,17 @@ class Primitive:
     patch: float
     palette: int
     yaw_deg: float = 0.0
+    detail: float = 1.0
+    gloss: float = 0.0
+    glow: float = 0.0
 
     @property
     def bound(self) -> float:
         """Radius of a sphere around the centre that holds the thing."""
         if self.kind in (tracing.SPHERE, tracing.BOWL):
             return self.size[0]
+        if self.kind == tracing.TORUS:
+            return sum(self.size)
         return math.sqrt(sum(side * side for side in self.size))
 
 
@@ -110,9 +128,41 @@ LIGHT: Floats = np.array([1.4, -2.2, 3.2])
 """A lamp below the ceiling; its shadows are part of the scene's paint."""
 
 
-def _build_table() -> Floats:
-    table = np.zeros((len(PRIMITIVES), tracing.NUM_COLUMNS))
-    for index, thing in enumerate(PRIMITIVES):
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All that can be filmed at once.
+
+    primitives: row 0 is the room that encloses the others. palettes: [K, 4, 3], four paints a row,
+    sRGB. light: [3], a lamp inside the room. subject: what meshes are judged on; its longest side
+    is the size that tolerances refer to. things: the same without floor and walls, which fit onto
+    themselves under many wrong moves. beyond: how far outside the subject a mesh is judged, metres:
+    of a room, whose wrong walls lie outside it.
+    """
+
+    name: str
+    primitives: tuple[Primitive, ...]
+    palettes: Floats
+    light: Floats
+    subject: Region
+    things: Region
+    beyond: float = 0.0
+
+    @cached_property
+    def room(self) -> Region:
+        """All that there is."""
+        center, half = np.array(self.primitives[0].center), np.array(self.primitives[0].size)
+        low, high = (tuple(map(float, side)) for side in (center - half, center + half))
+        return Region((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+    @cached_property
+    def table(self) -> Floats:
+        """The primitives as the compiled code reads them."""
+        return _build_table(self.primitives)
+
+
+def _build_table(primitives: tuple[Primitive, ...]) -> Floats:
+    table = np.zeros((len(primitives), tracing.NUM_COLUMNS))
+    for index, thing in enumerate(primitives):
         row = table[index]
         yaw = math.radians(thing.yaw_deg)
         row[tracing.COL_KIND] = thing.kind
@@ -123,10 +173,14 @@ def _build_table() -> Floats:
         row[tracing.COL_PATCH] = thing.patch
         row[tracing.COL_SEED] = 101 * (index + 1)
         row[tracing.COL_PALETTE] = thing.palette
+        row[tracing.COL_DETAIL] = thing.detail
+        row[tracing.COL_GLOSS] = thing.gloss
+        row[tracing.COL_GLOW] = thing.glow
     return table
 
 
-_TABLE = _build_table()
+SAMPLE = Scene("bowl", PRIMITIVES, PALETTES, LIGHT, SUBJECT, THINGS)
+"""The bowl among things: what `make demo` films."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +188,7 @@ class Hits:
     """What rays hit.
 
     t: [N] distance, metres. color: [N, 3] sRGB in [0, 1]. normal: [N, 3] unit, towards the ray's
-    side. primitive: [N] row of PRIMITIVES.
+    side. primitive: [N] row of the scene's primitives.
     """
 
     t: Floats
@@ -143,7 +197,7 @@ class Hits:
     primitive: NDArray[np.int64]
 
 
-def raycast(origins: Floats, directions: Floats) -> Hits:
+def raycast(origins: Floats, directions: Floats, scene: Scene = SAMPLE) -> Hits:
     """First hits of rays that start inside the room and outside the things.
 
     origins: [N, 3], world. directions: [N, 3], unit. Every such ray hits something.
@@ -157,18 +211,21 @@ def raycast(origins: Floats, directions: Floats) -> Hits:
         )
     if not np.allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-6):
         raise ValueError("directions must be unit vectors: divide them by their norm")
-    if not ROOM.contains(origins).all():
+    if not scene.room.contains(origins).all():
         raise ValueError("origins must lie inside the room")
     out = np.empty((len(origins), 7))
     rows = np.empty(len(origins), dtype=np.int64)
-    tracing.trace_rays(origins, directions, _TABLE, PALETTES, LIGHT, out, rows)
+    tracing.trace_rays(origins, directions, scene.table, scene.palettes, scene.light, out, rows)
     return Hits(out[:, 0], out[:, 4:7], out[:, 1:4], rows)
 
 
-def render(camera: Intrinsics, world_from_camera: Floats) -> NDArray[np.uint8]:
+def render(
+    camera: Intrinsics, world_from_camera: Floats, scene: Scene = SAMPLE, gain: float = 1.0
+) -> NDArray[np.uint8]:
     """A picture of the scene, uint8 [H, W, 3], sRGB, anti-aliased.
 
-    camera: a PINHOLE. world_from_camera: [3, 4], OpenGL axes. Releases the GIL while it works.
+    camera: a PINHOLE. world_from_camera: [3, 4], OpenGL axes. gain: factor on linear light, as a
+    phone's exposure changes it. Releases the GIL while it works.
     Raises ValueError for a lens with distortion.
     """
     if camera.model != "PINHOLE":
@@ -176,7 +233,10 @@ def render(camera: Intrinsics, world_from_camera: Floats) -> NDArray[np.uint8]:
     picture = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
     lens = np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy])
     pose = np.ascontiguousarray(world_from_camera, dtype=np.float64)
-    tracing.render_pinhole(pose, lens, _TABLE, PALETTES, LIGHT, picture)
+    # sRGB is about linear light to the power of 1 / 2.2, so a factor there is one here, too.
+    tracing.render_pinhole(
+        pose, lens, scene.table, scene.palettes, scene.light, gain ** (1 / 2.2), picture
+    )
     return picture
 
 
@@ -194,13 +254,13 @@ def pixel_rays(
     return np.broadcast_to(world_from_camera[:, 3], directions.shape).copy(), directions
 
 
-def depth_image(camera: Intrinsics, world_from_camera: Floats) -> Floats:
+def depth_image(camera: Intrinsics, world_from_camera: Floats, scene: Scene = SAMPLE) -> Floats:
     """Exact z-depth at the pixel centres, [H, W], metres."""
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     origins, directions = pixel_rays(camera, world_from_camera, pixels)
     forward = -world_from_camera[:, 2]
-    z_depth: Floats = raycast(origins, directions).t * (directions @ forward)
+    z_depth: Floats = raycast(origins, directions, scene).t * (directions @ forward)
     return z_depth.reshape(camera.height, camera.width)
 
 
@@ -209,7 +269,12 @@ def pose_matrix(image: PosedImage) -> Floats:
     return np.array(image.world_from_camera, dtype=np.float64)
 
 
-def seen_surface(truth: CamerasFile, region: Region = SUBJECT, num_points: int = 20_000) -> Floats:
+def seen_surface(
+    truth: CamerasFile,
+    region: Region = SUBJECT,
+    num_points: int = 20_000,
+    scene: Scene = SAMPLE,
+) -> Floats:
     """True surface points that the cameras saw, [num_points or fewer, 3], world, metres.
 
     Rays through pixels spread evenly over all pictures, cut to `region`, thinned evenly.
@@ -227,7 +292,7 @@ def seen_surface(truth: CamerasFile, region: Region = SUBJECT, num_points: int =
         origins, directions = pixel_rays(
             camera, pose_matrix(image), np.stack([x.ravel(), y.ravel()], axis=1)
         )
-        points = origins + raycast(origins, directions).t[:, None] * directions
+        points = origins + raycast(origins, directions, scene).t[:, None] * directions
         parts.append(points[region.contains(points)])
     points = np.concatenate(parts) if parts else np.empty((0, 3))
     keep = np.unique(np.linspace(0, len(points) - 1, min(num_points, len(points))).astype(int))
@@ -235,14 +300,14 @@ def seen_surface(truth: CamerasFile, region: Region = SUBJECT, num_points: int =
     return thinned
 
 
-def surface_distance(points: Floats) -> Floats:
+def surface_distance(points: Floats, scene: Scene = SAMPLE) -> Floats:
     """Distance of points [N, 3] to the nearest true surface, [N], metres, >= 0.
 
-    Exact, but for the soles of things on the floor, which count as surface though none sees them;
-    they coincide with the floor.
+    Exact, but for what lies inside or beneath things, which counts as surface though none sees it:
+    soles coincide with the floor, and where things overlap a part of one is within the other.
     """
     best = np.full(len(points), np.inf)
-    for thing in PRIMITIVES:
+    for thing in scene.primitives:
         best = np.minimum(best, _distance_to(thing, points))
     return best
 
@@ -259,6 +324,9 @@ def _distance_to(thing: Primitive, points: Floats) -> Floats:
     rho, z = np.hypot(local[:, 0], local[:, 1]), local[:, 2]
     if thing.kind == tracing.CYLINDER:
         return _box_distance(np.stack([rho, np.abs(z)], axis=1), size)
+    if thing.kind == tracing.TORUS:
+        ring = np.hypot(local[:, 0], z) - size[0]
+        return np.asarray(np.abs(np.hypot(ring, local[:, 1]) - size[1]))
     rim = np.hypot(rho - np.clip(rho, size[1], size[0]), z)
     radius = np.hypot(rho, z)
     shells = np.minimum(np.abs(radius - size[0]), np.abs(radius - size[1]))

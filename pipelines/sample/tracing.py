@@ -2,8 +2,9 @@
 
 A scene is a float64 table, one primitive a row, columns named by the `COL_*` constants; row 0 is
 the room that encloses everything. Lengths are metres, the frame is the world of the scene (+Z up),
-colours are sRGB in [0, 1] without any dependence on the view. Kernels release the GIL, so callers
-spread work over Python threads and need no threading layer of numba's.
+colours are sRGB in [0, 1], above 1 for what glows, and depend on the view on glossy things only.
+Kernels release the GIL, so callers spread work over Python threads and need no threading layer of
+numba's.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-ROOM, SPHERE, BOX, CYLINDER, BOWL = 0, 1, 2, 3, 4
+ROOM, SPHERE, BOX, CYLINDER, BOWL, TORUS = 0, 1, 2, 3, 4, 5
 
 COL_KIND = 0
 COL_CENTER = 1  # three columns
@@ -25,7 +26,10 @@ COL_BOUND = 9  # radius of a sphere around the centre that holds the primitive
 COL_PATCH = 10  # size of the largest colour patches, metres
 COL_SEED = 11
 COL_PALETTE = 12  # a bowl paints its inside with the next palette
-NUM_COLUMNS = 13
+COL_DETAIL = 13  # strength of the fine paint, 1 as a rule
+COL_GLOSS = 14  # share of light that is mirrored when looked at squarely; 0 is matt
+COL_GLOW = 15  # brightness of what glows by itself; 0 for what the lamp lights
+NUM_COLUMNS = 16
 
 _EPS = 1e-6  # metres: a ray never hits the surface that it starts on
 _FAR = 1e30
@@ -197,6 +201,36 @@ def _hit_bowl(o: Any, d: Any, row: Any) -> _Four:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _hit_torus(o: Any, d: Any, row: Any) -> _Four:
+    """An upright ring around the y axis: radius of the ring and of its tube.
+
+    Marches by the exact distance, then closes in by Newton's steps, which need the slope.
+    """
+    ring, tube = row[COL_SIZE], row[COL_SIZE + 1]
+    b = o[0] * d[0] + o[1] * d[1] + o[2] * d[2]
+    disc = b * b - (o[0] * o[0] + o[1] * o[1] + o[2] * o[2] - (ring + tube) ** 2)
+    if disc <= 0.0:
+        return _FAR, 0.0, 0.0, 0.0
+    t, last = max(-b - math.sqrt(disc), _EPS), -b + math.sqrt(disc)
+    for _ in range(200):
+        x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+        rho = math.hypot(x, z)
+        across = math.hypot(rho - ring, y)
+        gap = across - tube
+        out = (rho - ring) / (across * rho)
+        nx, ny, nz = x * out, y / across, z * out
+        if gap < 1e-11:
+            break
+        slope = -(nx * d[0] + ny * d[1] + nz * d[2])
+        t += gap / slope if gap < 0.02 * tube and slope > 0.05 else gap
+        if t > last:
+            return _FAR, 0.0, 0.0, 0.0
+    if gap > 1e-7 or t <= _EPS:
+        return _FAR, 0.0, 0.0, 0.0
+    return t, nx, ny, nz
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _hit(o: Any, d: Any, row: Any) -> _Four:
     """First hit of one primitive, normal in its own axes. o, d: in its own axes."""
     kind = int(row[COL_KIND])
@@ -208,6 +242,8 @@ def _hit(o: Any, d: Any, row: Any) -> _Four:
         return _hit_box(o, d, row)
     if kind == CYLINDER:
         return _hit_cylinder(o, d, row)
+    if kind == TORUS:
+        return _hit_torus(o, d, row)
     return _hit_bowl(o, d, row)
 
 
@@ -266,8 +302,8 @@ def _trace(p: Any, d: Any, table: Any, out: Any, scratch: Any) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _shade(p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scratch: Any) -> int:
-    """Trace and paint: out[0:4] as `_trace`, out[4:7] = colour."""
+def _paint(p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scratch: Any) -> int:
+    """Trace and paint: out[0:4] as `_trace`, out[4:7] = colour without gloss."""
     index = _trace(p, d, table, out, scratch)
     row = table[index]
     at, local, unused = scratch[3], scratch[4], scratch[5]
@@ -275,7 +311,7 @@ def _shade(p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scra
         # A little off the surface, so that it does not shade itself.
         at[k] = p[k] + out[0] * d[k] + 1e-5 * out[1 + k]
     _to_local(at, d, row, local, unused)
-    palette, patch, detail = int(row[COL_PALETTE]), row[COL_PATCH], 1.0
+    palette, patch, detail = int(row[COL_PALETTE]), row[COL_PATCH], row[COL_DETAIL]
     if int(row[COL_KIND]) == BOWL:
         r2 = local[0] ** 2 + local[1] ** 2 + local[2] ** 2
         palette += int(r2 < (0.5 * (row[COL_SIZE] + row[COL_SIZE + 1])) ** 2)
@@ -284,12 +320,15 @@ def _shade(p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scra
             # The floor begins nearer than the walls do; far off, it is seen at a grazing angle,
             # where fine paint would only alias.
             patch *= 0.45
-            detail -= 0.75 * _smooth_step(1.2, 4.0, math.hypot(local[0], local[1]))
+            detail = 1.0 - 0.75 * _smooth_step(1.2, 4.0, math.hypot(local[0], local[1]))
         else:
             palette += 1
     red, green, blue = _albedo(
         local[0], local[1], local[2], patch, detail, int(row[COL_SEED]), palettes[palette]
     )
+    if row[COL_GLOW] > 0.0:
+        out[4], out[5], out[6] = red * row[COL_GLOW], green * row[COL_GLOW], blue * row[COL_GLOW]
+        return index
     lx, ly, lz = light[0] - at[0], light[1] - at[1], light[2] - at[2]
     facing = (out[1] * lx + out[2] * ly + out[3] * lz) / math.sqrt(lx * lx + ly * ly + lz * lz)
     brightness = 0.62 + 0.06 * out[3]
@@ -302,6 +341,36 @@ def _shade(p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scra
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _shade(p: Any, d: Any, table: Any, palettes: Any, light: Any, out: Any, scratch: Any) -> int:
+    """Trace and paint: out[0:4] as `_trace`, out[4:7] = colour.
+
+    A glossy thing mirrors the scene once, as a matt one would see it, more at grazing angles
+    (Schlick, "An inexpensive BRDF model", Computer Graphics Forum 13(3), 1994, eq. 15), and shows
+    the lamp as a sharp highlight.
+    """
+    index = _paint(p, d, table, palettes, light, out, scratch)
+    gloss = table[index, COL_GLOSS]
+    if gloss <= 0.0:
+        return index
+    start, way, mirrored = scratch[6, :3], scratch[7, :3], scratch[8]
+    facing = -(out[1] * d[0] + out[2] * d[1] + out[3] * d[2])
+    distance2 = 0.0
+    for k in range(3):
+        start[k] = p[k] + out[0] * d[k] + 1e-5 * out[1 + k]
+        way[k] = d[k] + 2.0 * facing * out[1 + k]
+        distance2 += (light[k] - start[k]) ** 2
+    _paint(start, way, table, palettes, light, mirrored, scratch)
+    share = gloss + (1.0 - gloss) * (1.0 - facing) ** 5
+    toward = 0.0
+    for k in range(3):
+        toward += way[k] * (light[k] - start[k]) / math.sqrt(distance2)
+    highlight = 0.9 * max(toward, 0.0) ** 300 if _is_lit(start, light, table, scratch) else 0.0
+    for k in range(3):
+        out[4 + k] = (1.0 - share) * out[4 + k] + share * mirrored[4 + k] + highlight
+    return index
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def trace_rays(
     origins: Any, directions: Any, table: Any, palettes: Any, light: Any, out: Any, rows: Any
 ) -> None:
@@ -309,20 +378,21 @@ def trace_rays(
 
     Fills out [N, 7] with distance, normal, colour, and rows [N] with the primitive that was hit.
     """
-    scratch = np.empty((6, 3))
+    scratch = np.empty((9, 7))
     for i in range(origins.shape[0]):
         rows[i] = _shade(origins[i], directions[i], table, palettes, light, out[i], scratch)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def render_pinhole(
-    pose: Any, lens: Any, table: Any, palettes: Any, light: Any, picture: Any
+    pose: Any, lens: Any, table: Any, palettes: Any, light: Any, gain: float, picture: Any
 ) -> None:
     """Render a picture, uint8 [H, W, 3]. pose: world_from_camera [3, 4]; lens: fl_x, fl_y, cx, cy.
 
+    gain: factor on sRGB values; what comes out above 1 is clipped, as on a sensor.
     Two samples on a pixel's diagonal; where they differ, the two of the other diagonal as well.
     """
-    scratch = np.empty((6, 3))
+    scratch = np.empty((9, 7))
     out = np.empty(7)
     direction = np.empty(3)
     origin = pose[:, 3].copy()
@@ -351,4 +421,5 @@ def render_pinhole(
                     total[k] += out[4 + k]
                 num_samples += 1
             for k in range(3):
-                picture[y, x, k] = np.uint8(total[k] / num_samples * 255.0 + 0.5)
+                value = min(gain * total[k] / num_samples, 1.0)
+                picture[y, x, k] = np.uint8(value * 255.0 + 0.5)

@@ -1,9 +1,8 @@
-"""The ladder of attempts at a reconstruction, with its progress and its checkpoint.
+"""Climbing the ladder of attempts at a reconstruction, with its progress and its checkpoint.
 
-First the quick way (docs/poses.md has what was measured): features as coarse as the capture
-allows, the planned pairs, few trials, few adjustments. Where too few images register, COLMAP's own
-thorough way with all pairs, in a database of its own; then relaxed thresholds. The attempt with
-most images wins. The two databases, with features and matches, are the checkpoint.
+`pipelines.sfm.rungs` says which attempts there are: first the quick way (docs/poses.md has what was
+measured), then more thorough ones where too few images register. The attempt with most images wins.
+The databases, with features and matches, are the checkpoint.
 """
 
 from __future__ import annotations
@@ -13,56 +12,51 @@ import json
 import os
 import statistics
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from pipelines.options import PosesOptions
+from pipelines.sfm.intrinsics import mapping_lens
 from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
 from pipelines.sfm.report import Attempt, Outcome, check_features
 from pipelines.sfm.retrieval import FEATURES_PER_IMAGE, image_vectors, retrieval_pairs
+from pipelines.sfm.rungs import MAX_ALL_PAIRS, RUNGS, Matches, Rung, Standing
 from pipelines.sfm.source import Source, camera_groups
 from pipelines.sfm.turning import is_turning
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import (
     FeatureSettings,
-    MapperSettings,
     Reconstructor,
     Watch,
     extraction_threads,
 )
-
-MAX_RETRY_IMAGES = 300
-"""Beyond this, matching all pairs takes hours and is not tried."""
+from pipelines.tools.colmap_results import PairStatistics
 
 NUM_PROBES = 5
 """Images, spread over the capture, whose features are counted before the rest."""
 ENOUGH_FEATURES = 500
 """Median of the probes from which images are not doubled before features are found."""
 
-_FORMAT = 2
-"""Of the checkpoint: raised where the same options give other databases."""
+_FORMAT = 3
+"""Of the checkpoint: raised where the same options give other databases or names of steps."""
 
 Span = tuple[float, float]
-_FEATURES: Span = (0.0, 0.25)
-_MATCHING: Span = (0.25, 0.5)
-_MAPPING: Span = (0.5, 0.9)
-_RETRY_FEATURES: Span = (0.9, 0.92)
-_RETRY_MATCHING: Span = (0.92, 0.95)
-_RETRY_MAPPING: Span = (0.95, 0.97)
-_RELAXED: Span = (0.97, 0.98)
+_FIRST, _LAST = 0.9, 0.97
+"""Where in the stage's progress the first rung ends, and the last."""
+_FOUND, _MATCHED = 0.28, 0.56
+"""Where in a rung's part of it the features are found, and the pairs matched."""
 
 
 class Checkpoint:
     """The databases, and which steps are complete in them: a retried attempt goes on from there.
 
-    `database` is that of the quick way, `thorough_database` that of the thorough one. Databases
-    without a state file, or made from other inputs or options, are thrown away.
+    Databases without a state file, or made from other inputs or options, are thrown away.
     """
 
     def __init__(self, ctx: StageContext, source: Source, options: PosesOptions) -> None:
         self._ctx = ctx
         self._state_file = ctx.checkpoint / "state.json"
-        self.database = ctx.checkpoint / "colmap.db"
-        self.thorough_database = ctx.checkpoint / "thorough.db"
         inputs = [
             (file, path.stat().st_size)
             for file, path in zip(source.files, source.paths, strict=True)
@@ -75,14 +69,19 @@ class Checkpoint:
         self._fingerprint = hashlib.sha256(text.encode()).hexdigest()
         self._steps: list[str] = []
         ctx.checkpoint.mkdir(parents=True, exist_ok=True)
-        if self._state_file.is_file() and self.database.is_file():
+        if self._state_file.is_file():
             state = json.loads(self._state_file.read_text("utf-8"))
-            if state["fingerprint"] == self._fingerprint:
+            here = all(self.database(step.split()[0]).is_file() for step in state["steps"])
+            if here and state["fingerprint"] == self._fingerprint:
                 self._steps = list(state["steps"])
         if not self._steps:
             self._state_file.unlink(missing_ok=True)
-            for stale in (*ctx.checkpoint.glob("colmap.db*"), *ctx.checkpoint.glob("thorough.db*")):
+            for stale in list(ctx.checkpoint.glob("*.db*")):
                 stale.unlink()
+
+    def database(self, name: str) -> Path:
+        """Where the database of that name lies, or will."""
+        return self._ctx.checkpoint / f"{name}.db"
 
     def has(self, step: str) -> bool:
         """Whether that step is complete in its database."""
@@ -135,7 +134,7 @@ class ProgressScale:
 
 
 class Ladder:
-    """The attempts on one capture. `climb` runs them."""
+    """The attempts on one capture. `climb` runs them; `outcome` is what came of them so far."""
 
     def __init__(
         self,
@@ -144,7 +143,9 @@ class Ladder:
         source: Source,
         options: PosesOptions,
         ctx: StageContext,
+        rungs: Sequence[Rung] = RUNGS,
     ) -> None:
+        self._rungs = rungs
         self._reconstructor = reconstructor
         self._checkpoint = checkpoint
         self._source = source
@@ -152,6 +153,12 @@ class Ladder:
         self._ctx = ctx
         self._progress = ProgressScale(ctx)
         self._attempts: list[Attempt] = []
+        self._statistics = PairStatistics.nothing(len(source.files))
+
+    @property
+    def outcome(self) -> Outcome:
+        """All attempts so far, and what the last matching found."""
+        return Outcome(tuple(self._attempts), self._statistics)
 
     def climb(self) -> Outcome:
         """Run attempts until enough images are registered, or none is left; none at all where the
@@ -159,38 +166,36 @@ class Ladder:
 
         Raises PosesError (no_features) before matching where images hold nothing to match.
         """
-        num, options = len(self._source.files), self._options
-        matcher = choose_matcher(num, options.matcher, is_video=self._source.is_video)
-        self._progress.aim(0.0, _MAPPING[1])
-        self._extract(_FEATURES, thorough=False)
-        check_features(self._reconstructor.statistics(), options)
-        self._match(matcher, _MATCHING, thorough=False)
-        if is_turning(self._reconstructor.statistics()):
-            return Outcome((), self._reconstructor.statistics())
-        self._map(matcher, _MAPPING, MapperSettings(refine_principal_point=self._principal))
-        if not self._is_enough():
-            self._climb_thoroughly("exhaustive" if num <= MAX_RETRY_IMAGES else matcher)
-        return Outcome(tuple(self._attempts), self._reconstructor.statistics())
+        for rung, (start, end) in zip(self._rungs, _spans(len(self._rungs)), strict=True):
+            if not rung.when(self._standing()):
+                continue
+            self._reconstructor = self._reconstructor.on(
+                self._checkpoint.database(rung.matches.database)
+            )
+            self._progress.aim(start, end)
+            found, matched = (start + share * (end - start) for share in (_FOUND, _MATCHED))
+            matcher = self._matcher(rung.matches)
+            self._extract(rung.matches, (start, found))
+            self._statistics = self._reconstructor.statistics()
+            if not self._attempts:
+                check_features(self._statistics, self._options)
+            self._match(rung.matches, matcher, (found, matched))
+            self._statistics = self._reconstructor.statistics()
+            if not self._attempts and is_turning(self._statistics):
+                break
+            self._map(rung, matcher, (matched, end))
+        return self.outcome
 
-    def _climb_thoroughly(self, matcher: str) -> None:
-        """COLMAP's own thoroughness, and where that does not do either, lower thresholds."""
-        self._reconstructor = self._reconstructor.on(self._checkpoint.thorough_database)
-        self._progress.aim(_RETRY_FEATURES[0], _RETRY_MAPPING[1])
-        self._extract(_RETRY_FEATURES, thorough=True)
-        self._match(matcher, _RETRY_MATCHING, thorough=True)
-        settings = MapperSettings(refine_principal_point=self._principal, thorough=True)
-        self._map(matcher, _RETRY_MAPPING, settings)
-        if not self._is_enough():
-            self._progress.aim(*_RELAXED)
-            self._map(matcher, _RELAXED, replace(settings, relaxed=True))
+    def _standing(self) -> Standing:
+        most = max((attempt.num_registered for attempt in self._attempts), default=0)
+        return Standing(len(self._source.files), most, self._options.retry_below_ratio)
 
-    @property
-    def _principal(self) -> bool:
-        return self._options.refine_principal_point
-
-    def _is_enough(self) -> bool:
-        most = max(attempt.num_registered for attempt in self._attempts)
-        return most >= self._options.retry_below_ratio * len(self._source.files)
+    def _matcher(self, wanted: Matches) -> str:
+        """How this rung's pairs are chosen: sequential, exhaustive or retrieval."""
+        num = len(self._source.files)
+        if wanted.all_pairs and num <= MAX_ALL_PAIRS:
+            return "exhaustive"
+        return choose_matcher(num, self._options.matcher, is_video=self._source.is_video)
 
     def _settings(self, *, upsample: bool) -> FeatureSettings:
         options = self._options
@@ -211,14 +216,14 @@ class Ladder:
         self._ctx.logger.info("features of images %s without doubling: %s", probes, counts)
         return statistics.median(counts) < ENOUGH_FEATURES
 
-    def _extract(self, span: Span, *, thorough: bool) -> None:
-        step = _step("features", thorough=thorough)
+    def _extract(self, wanted: Matches, span: Span) -> None:
+        step = f"{wanted.database} features"
         if self._checkpoint.has(step):
             self._ctx.logger.info("%s are in the checkpoint", step)
             return
         self._reconstructor.extract(
-            camera_groups(self._source, self._options.camera_model),
-            self._settings(upsample=thorough or self._must_upsample()),
+            camera_groups(self._source, mapping_lens(self._options.camera_model)),
+            self._settings(upsample=wanted.doubled or self._must_upsample()),
             self._progress.watch(span, len(self._source.files), "features of image"),
         )
         self._checkpoint.save(step)
@@ -232,42 +237,37 @@ class Ladder:
             return retrieval_pairs(vectors, options.retrieval_neighbours)
         return planned_pairs(num, matcher, options.sequential_overlap)
 
-    def _match(self, matcher: str, span: Span, *, thorough: bool) -> None:
-        step = _step(matcher, thorough=thorough)
+    def _match(self, wanted: Matches, matcher: str, span: Span) -> None:
+        step = f"{wanted.database} {matcher}"
         if self._checkpoint.has(step):
             self._ctx.logger.info("%s matches are in the checkpoint", step)
             return
         pairs = self._pairs(matcher)
         watch = self._progress.watch(span, len(pairs), "matching pair")
-        self._reconstructor.match(pairs, watch, thorough=thorough)
+        self._reconstructor.match(pairs, watch, thorough=wanted.thorough)
         self._checkpoint.save(step)
 
-    def _map(self, matcher: str, span: Span, settings: MapperSettings) -> None:
+    def _map(self, rung: Rung, matcher: str, span: Span) -> None:
         began = time.monotonic()
         num = len(self._source.files)
+        settings = replace(rung.mapper, refine_principal_point=self._options.refine_principal_point)
         models = self._reconstructor.map(settings, self._progress.watch(span, num, "placing image"))
-        attempt = Attempt(
-            matcher,
-            settings.thorough,
-            settings.relaxed,
-            tuple(models),
-            time.monotonic() - began,
-        )
+        attempt = Attempt(rung, matcher, tuple(models), time.monotonic() - began)
         self._attempts.append(attempt)
         self._ctx.logger.info(
-            "%s matching%s%s: %d of %d images registered, models of %s",
+            "%s attempt, %s matching: %d of %d images registered, models of %s",
+            rung.name,
             matcher,
-            ", thorough" if settings.thorough else "",
-            ", relaxed" if settings.relaxed else "",
             attempt.num_registered,
             num,
             [len(model.indices) for model in models],
         )
 
 
-def _step(name: str, *, thorough: bool) -> str:
-    """What a step is called in the checkpoint."""
-    return f"thorough {name}" if thorough else name
+def _spans(num: int) -> list[Span]:
+    """Each rung's part of the stage's progress: most for the first, mostly the only one."""
+    edges = [_FIRST + (_LAST - _FIRST) * i / max(num - 1, 1) for i in range(num)]
+    return list(zip([0.0, *edges], edges, strict=False))
 
 
 def _num_processors() -> int:

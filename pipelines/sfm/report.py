@@ -1,14 +1,20 @@
-"""What came of a reconstruction: is it usable, and why were images left out."""
+"""What came of a reconstruction: is it usable, why were images left out, and what report.json says.
+
+report.json is written by a stage that fails too: see `report_of_failure`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipelines.errors import PosesError
+from pipelines.errors import PipelineError, PosesError
 from pipelines.options import PosesOptions
+from pipelines.sfm.intrinsics import LensVerdict, lens_warnings
+from pipelines.sfm.rungs import RUNGS, Rung
 from pipelines.sfm.source import Source
 from pipelines.sfm.turning import is_turning
 from pipelines.tools.colmap_results import PairStatistics, SparseModel, best_model
@@ -25,18 +31,23 @@ _MOVE_HINT = (
     "shows nothing of depth."
 )
 
+_ADVICE = {
+    "other_model": "Parts of the capture do not hang together: film on without a break between "
+    "them, or go back over a place that both show.",
+    "too_few_features": "Some images show too little: more light, less blur, textured things.",
+    "too_few_matches": "Neighbouring images share too little: move more slowly, with more overlap.",
+    "pose_rejected": "Images match that do not fit together: avoid moving things, mirrors and "
+    "surfaces that repeat themselves.",
+}
+"""What helps against each reason for which an image is left out."""
+
 
 @dataclass(frozen=True)
 class Attempt:
-    """One run of the mapper.
+    """One run of the mapper. matcher: which pairs. models: all it found, in COLMAP's order."""
 
-    matcher: which pairs. thorough: COLMAP's own number of trials and adjustments. relaxed: lower
-    thresholds. models: all it found, in COLMAP's order.
-    """
-
+    rung: Rung
     matcher: str
-    thorough: bool
-    relaxed: bool
     models: tuple[SparseModel, ...]
     seconds: float
 
@@ -61,7 +72,7 @@ class Outcome:
     @property
     def chosen(self) -> Attempt:
         """The attempt that placed most images, the earliest among equals; empty without any."""
-        nothing = Attempt("", thorough=False, relaxed=False, models=(), seconds=0.0)
+        nothing = Attempt(RUNGS[0], matcher="", models=(), seconds=0.0)
         return max(self.attempts, key=lambda attempt: attempt.num_registered, default=nothing)
 
 
@@ -167,37 +178,33 @@ def gaps(outcome: Outcome, source: Source) -> list[tuple[float, float]]:
     return found
 
 
-def build_report(
-    outcome: Outcome, model: SparseModel, source: Source, world: dict[str, Any]
-) -> dict[str, Any]:
-    """The contents of report.json. world: how the frame was chosen, added as it is."""
+def build_report(outcome: Outcome, source: Source) -> dict[str, Any]:
+    """What report.json holds of every climb, also of one that ended without usable poses."""
     num = len(source.files)
-    statistics = outcome.statistics
+    chosen, statistics = outcome.chosen, outcome.statistics
     return {
         "num_images": num,
-        "num_registered": len(model.indices),
-        "registered_ratio": len(model.indices) / num,
-        "mean_reprojection_error_px": model.error_px,
-        "median_triangulation_angle_deg": model.angle_deg,
-        "num_points": len(model.points),
-        "num_cameras": len(model.cameras),
+        "num_registered": chosen.num_registered,
+        "registered_ratio": chosen.num_registered / num,
+        "metric": False,
         "models": [
             {
                 "num_images": len(found.indices),
                 "num_points": len(found.points),
-                "chosen": found is model,
+                "chosen": found is chosen.best,
             }
-            for found in outcome.chosen.models
+            for found in chosen.models
         ],
         "attempts": [
             {
+                "rung": attempt.rung.name,
                 "matcher": attempt.matcher,
-                "thorough": attempt.thorough,
-                "relaxed": attempt.relaxed,
+                "thorough": attempt.rung.mapper.thorough,
+                "relaxed": attempt.rung.is_relaxed,
                 "num_registered": attempt.num_registered,
                 "model_sizes": [len(found.indices) for found in attempt.models],
                 "seconds": round(attempt.seconds, 2),
-                "chosen": attempt is outcome.chosen,
+                "chosen": attempt is chosen,
             }
             for attempt in outcome.attempts
         ],
@@ -207,9 +214,45 @@ def build_report(
             "num_one_homography": len(statistics.homographies),
             "mean_features": float(statistics.num_features.mean()),
         },
-        "world": world,
         "unregistered": unregistered_images(outcome, source),
         "gaps_s": gaps(outcome, source),
+    }
+
+
+def report_of_model(
+    model: SparseModel, lenses: Sequence[LensVerdict], world: dict[str, Any]
+) -> dict[str, Any]:
+    """What report.json holds besides where the poses are usable.
+
+    lenses: those of the camera with most images first. world: how the frame was chosen.
+    """
+    return {
+        "mean_reprojection_error_px": model.error_px,
+        "median_triangulation_angle_deg": model.angle_deg,
+        "num_points": len(model.points),
+        "num_cameras": len(model.cameras),
+        "intrinsics": {
+            **lenses[0].as_dict(),
+            "other_cameras": [found.as_dict() for found in lenses[1:]],
+        },
+        "warnings": lens_warnings(lenses),
+        "world": world,
+    }
+
+
+def report_of_failure(
+    outcome: Outcome, source: Source, options: PosesOptions, error: PipelineError
+) -> dict[str, Any]:
+    """report.json of a stage that ends with an error: what there is, why, and what to do."""
+    report = build_report(outcome, source)
+    reasons = Counter(entry["code"] for entry in report["unregistered"])
+    failure = {key: error.as_dict()[key] for key in ("code", "message", "hint", "details")}
+    return {
+        **report,
+        "num_needed": num_needed(len(source.files), options),
+        "error": failure,
+        "reasons": dict(reasons),
+        "advice": [error.hint, *(_ADVICE[code] for code, _ in reasons.most_common())],
     }
 
 

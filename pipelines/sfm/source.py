@@ -1,8 +1,13 @@
-"""Which images a capture's poses are asked for, in which order, and which of them share a lens."""
+"""Which images a capture's poses are asked for, in which order, and which of them share a lens.
+
+What EXIF said of camera and lens comes from the record of `ingest`: the pictures have none left.
+"""
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +18,11 @@ from pipelines.errors import CaptureError
 from pipelines.tools.colmap import CameraGroup
 from pipelines.workspace import Workspace
 
-_MAKE, _MODEL, _EXIF_IFD = 271, 272, 0x8769
-_FOCAL_MM, _FOCAL_35MM = 37386, 41989
-"""EXIF tags, from the Exif 2.32 standard."""
+_LENS_KEYS = ("make", "model", "lens", "focal_mm", "focal_35mm")
+"""What of `pipelines.captures.exif.Exif` tells lenses apart."""
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
+_FOCAL_RANGE = (0.2, 50.0)
+"""Focal lengths that are believed, in long sides of the picture: a fisheye's to a telescope's."""
 _FEW_VIEWS = 5
 """A lens seen by fewer images gets one radial coefficient: more would fit noise."""
 
@@ -25,13 +32,15 @@ class Source:
     """Images in capture order.
 
     root: folder that `files` are relative to. files: paths with "/". timestamps_s: seconds of the
-    film, all None for photos. is_video: whether neighbours in the list are neighbours in time.
+    film, None for photos and for frames whose time the file does not say. is_video: whether
+    neighbours in the list are neighbours in time. exif: what the record says of each photo.
     """
 
     root: Path
     files: tuple[str, ...]
     timestamps_s: tuple[float | None, ...]
     is_video: bool
+    exif: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def paths(self) -> list[Path]:
@@ -49,12 +58,13 @@ def read_source(workspace: Workspace) -> Source:
     if listing.is_file():
         frames = json.loads(listing.read_text("utf-8"))["frames"]
         files = tuple(str(frame["file"]) for frame in frames)
-        times = tuple(float(frame["timestamp_s"]) for frame in frames)
+        times = tuple(_seconds(frame["timestamp_s"]) for frame in frames)
         source = Source(root, files, times, is_video=True)
     else:
         capture = json.loads((root / "capture.json").read_text("utf-8"))
         files = tuple(str(image["file"]) for image in capture["images"])
-        source = Source(root, files, (None,) * len(files), is_video=False)
+        exif = tuple(image.get("exif", {}) for image in capture["images"])
+        source = Source(root, files, (None,) * len(files), is_video=False, exif=exif)
     missing = [file for file in source.files if not (root / file).is_file()]
     if not source.files or missing:
         raise CaptureError(
@@ -72,34 +82,56 @@ def read_source(workspace: Workspace) -> Source:
 
 
 def camera_groups(source: Source, lens: str) -> tuple[CameraGroup, ...]:
-    """Images that share a lens, each with the COLMAP model to fit.
+    """Images that share a lens, each with the COLMAP model to fit and the focal length EXIF gives.
 
     Frames of a video are one group. Photos are grouped by size and by what EXIF says of camera and
     focal length. lens: the model wanted; groups of few images get a simpler one than OPENCV.
     Raises CaptureError (image_undecodable) for a file that is no picture.
     """
+    if source.is_video:
+        return (_group(range(len(source.files)), lens, None),)
     members: dict[tuple[Any, ...], list[int]] = {}
-    for index, path in enumerate(source.paths):
-        members.setdefault(() if source.is_video else _lens_of(path), []).append(index)
-    return tuple(
-        CameraGroup(
-            indices=tuple(indices),
-            lens="SIMPLE_RADIAL" if lens == "OPENCV" and len(indices) < _FEW_VIEWS else lens,
-        )
-        for indices in members.values()
-    )
+    focal_px: dict[tuple[Any, ...], float | None] = {}
+    exif = source.exif or ({},) * len(source.files)
+    for index, (path, tags) in enumerate(zip(source.paths, exif, strict=True)):
+        width, height = _size_of(path)
+        key = (width, height, *(tags.get(name) for name in _LENS_KEYS))
+        members.setdefault(key, []).append(index)
+        focal_px[key] = prior_focal_px(tags, width, height)
+    return tuple(_group(indices, lens, focal_px[key]) for key, indices in members.items())
 
 
-def _lens_of(path: Path) -> tuple[Any, ...]:
-    """What tells lenses apart: size, make, model, focal lengths."""
+def prior_focal_px(exif: Mapping[str, Any], width: int, height: int) -> float | None:
+    """The focal length in pixels of a picture of that size, by its EXIF; None where it is silent.
+
+    From the 35 mm equivalent, which compares diagonals (CIPA DCG-001), else from the focal length
+    and the sensor's long side. Values that no camera has are not believed.
+    """
+    long_side = max(width, height)
+    if exif.get("focal_35mm"):
+        focal = exif["focal_35mm"] / _DIAGONAL_35MM * math.hypot(width, height)
+    elif exif.get("focal_mm") and exif.get("sensor_mm"):
+        focal = exif["focal_mm"] / exif["sensor_mm"] * long_side
+    else:
+        return None
+    return focal if _FOCAL_RANGE[0] <= focal / long_side <= _FOCAL_RANGE[1] else None
+
+
+def _group(indices: Sequence[int], lens: str, focal_px: float | None) -> CameraGroup:
+    simple = lens == "OPENCV" and len(indices) < _FEW_VIEWS
+    return CameraGroup(tuple(indices), "SIMPLE_RADIAL" if simple else lens, focal_px)
+
+
+def _size_of(path: Path) -> tuple[int, int]:
+    """Width and height of a picture file."""
     try:
         with Image.open(path) as image:
-            size = image.size
-            exif = image.getexif()
-            detail = exif.get_ifd(_EXIF_IFD)
+            return image.size
     except (UnidentifiedImageError, OSError) as error:
         raise CaptureError(
             f"{path.name} is not a picture that can be read.", code="image_undecodable"
         ) from error
-    tags = (exif.get(_MAKE), exif.get(_MODEL), detail.get(_FOCAL_MM), detail.get(_FOCAL_35MM))
-    return (*size, *(str(tag) for tag in tags))
+
+
+def _seconds(value: float | None) -> float | None:
+    return None if value is None else float(value)

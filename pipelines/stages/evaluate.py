@@ -2,9 +2,9 @@
 
 Reads `train/model.zip` and the images with their masks. Held-out views are rendered at the size
 that was trained on, with the capture's poses and the mean appearance code, or, where the options
-ask for it, with what the test-time procedure fitted (`pipelines.nerf.test_time`); pixels that a
-mask leaves out are not measured. `protocol` says which of this was done. Writes `metrics.json` and
-`images/<name>.jpg`: truth | render | error.
+ask for it, with what the test-time procedure fitted (`pipelines.nerf.judging.test_time`); pixels
+that a mask leaves out are not measured. `protocol` says which of this was done. Writes
+`metrics.json` and `images/<name>.jpg`: truth | render | error.
 """
 
 from __future__ import annotations
@@ -25,19 +25,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from pipelines.cameras_file import PosedImage
 from pipelines.errors import ExportError
-from pipelines.evaluation_protocol import protocol
-from pipelines.nerf.cameras import Cameras
-from pipelines.nerf.data import ImageData, load_images
+from pipelines.nerf.data.images import ImageData, load_images
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.evaluation_config import EvaluateConfig
-from pipelines.nerf.floaters import floater_measures, opacity_of_density
-from pipelines.nerf.lpips import Lpips, lpips_if_configured
-from pipelines.nerf.metrics import psnr, ssim
-from pipelines.nerf.off_path import off_path_cameras
-from pipelines.nerf.renderer import RenderedImage
-from pipelines.nerf.test_time import (
+from pipelines.nerf.judging.floaters import floater_measures, opacity_of_density
+from pipelines.nerf.judging.lpips import Lpips, lpips_if_configured
+from pipelines.nerf.judging.metrics import psnr, ssim
+from pipelines.nerf.judging.off_path import off_path_cameras
+from pipelines.nerf.judging.protocol import protocol
+from pipelines.nerf.judging.test_time import (
     FittedCodes,
     FittedPoses,
     fit_appearance,
@@ -45,9 +41,14 @@ from pipelines.nerf.test_time import (
     half_columns,
     other_half,
 )
-from pipelines.options import StageOptions, evaluate_config
+from pipelines.nerf.options.evaluate import EvaluateConfig
+from pipelines.nerf.renderer import RenderedImage
+from pipelines.nerf.space.cameras import Cameras
+from pipelines.option_models import StageOptions
+from pipelines.options import evaluate_config
+from pipelines.scene.cameras_file import PosedImage
+from pipelines.scene.trained_scene import TrainedScene, as_uint8, nerf_cameras, nerf_errors_as
 from pipelines.stage import StageContext
-from pipelines.trained_scene import TrainedScene, as_uint8, nerf_cameras, nerf_errors_as
 
 LPIPS_WEIGHTS, LPIPS_SHA256 = "NERFWORKS_LPIPS_WEIGHTS", "NERFWORKS_LPIPS_SHA256"
 """Environment: a file or URL, or several with commas between, and their sums."""
@@ -148,17 +149,9 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     return metrics
 
 
-def _picked(images: list[PosedImage], at_most: int) -> list[PosedImage]:
-    """At most so many, evenly picked; 0 for all."""
-    if not at_most or len(images) <= at_most:
-        return images
-    rows = np.unique(np.linspace(0, len(images) - 1, at_most).round().astype(int))
-    return [images[row] for row in rows]
-
-
 def _load_views(scene: TrainedScene, config: EvaluateConfig, root: Path) -> _Views | None:
     """The held-out images, their masks and cameras; None where nothing was held out."""
-    posed = _picked(scene.test_images(), config.max_images)
+    posed = scene.test_images(config.max_images)
     if not posed:
         return None
     long_side = int(scene.extras["train"]["data"]["long_side_px"])

@@ -14,11 +14,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipelines.captures.hdr import TRANSFERS
+from pipelines.captures.minimum import MIN_IMAGES
 from pipelines.captures.record import CaptureRecord
 from pipelines.captures.video_frames import (
     DecodePlan,
     Frame,
-    can_tone_map,
     decode,
     reduced_size,
 )
@@ -26,7 +27,6 @@ from pipelines.errors import CaptureError
 from pipelines.options import FramesOptions
 from pipelines.stage import StageContext
 
-MIN_FRAMES = 3
 FRAMES_JSON = "frames.json"
 
 
@@ -97,10 +97,6 @@ def run(options: FramesOptions, ctx: StageContext) -> dict[str, Any]:
         )
     video = record.video
     warnings: list[str] = []
-    if video["hdr"] in ("hlg", "pq") and not can_tone_map():
-        warnings.append(
-            "The video is HDR, and this ffmpeg cannot convert it (no zscale): colours look flat."
-        )
     start_s = float(record.details.get("start_s", 0.0))
     length_s = max(float(video["duration_s"]) - start_s, 1e-6)
     keep_all = int(video["num_frames"]) <= options.num_frames
@@ -116,6 +112,7 @@ def run(options: FramesOptions, ctx: StageContext) -> dict[str, Any]:
         width=width,
         height=height,
         hdr=str(video["hdr"]),
+        matrix=video.get("matrix"),
         start_s=start_s,
         step_s=_step(video, options, length_s),
     )
@@ -132,7 +129,7 @@ def run(options: FramesOptions, ctx: StageContext) -> dict[str, Any]:
         "num_candidates": windows.num_seen,
         "width": width,
         "height": height,
-        "tone_mapped": video["hdr"] in ("hlg", "pq") and not warnings,
+        "tone_mapped": video["hdr"] in TRANSFERS,
         "warnings": warnings,
     }
 
@@ -167,9 +164,9 @@ def _check(windows: _Windows, num_decoded: int, num_expected: int, warnings: lis
             code="video_undecodable",
             hint="Check that it plays, or export it again as MP4 with H.264 or HEVC.",
         )
-    if len(windows.rows) < MIN_FRAMES:
+    if len(windows.rows) < MIN_IMAGES:
         raise CaptureError(
-            f"The video gave {len(windows.rows)} frames; at least {MIN_FRAMES} are needed.",
+            f"The video gave {len(windows.rows)} frames; at least {MIN_IMAGES} are needed.",
             code="too_few_images",
             hint="Film for 10 seconds or more, moving around the subject.",
         )

@@ -10,20 +10,20 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipelines.captures import images, nerfstudio, polycam, record3d, video
 from pipelines.captures.archive_rules import ArchiveLimits
+from pipelines.captures.catalogue import importer_of, load_reader
+from pipelines.captures.contents import PosedPictures
+from pipelines.captures.importers import video
+from pipelines.captures.leftovers import as_details, leftover_warnings, leftovers
+from pipelines.captures.photos import write_photos
+from pipelines.captures.posed import write_posed
 from pipelines.captures.record import CaptureRecord, Found
 from pipelines.captures.sniff import Sniffed, sniff
+from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 from pipelines.manifest import file_sha256
 from pipelines.options import IngestOptions
 from pipelines.stage import StageContext
-
-_POSED_READERS = {
-    "nerfstudio": nerfstudio.read,
-    "polycam": polycam.read,
-    "record3d": record3d.read,
-}
 
 
 def run(options: IngestOptions, ctx: StageContext) -> dict[str, Any]:
@@ -66,11 +66,39 @@ def run(options: IngestOptions, ctx: StageContext) -> dict[str, Any]:
 
 
 def _read(sniffed: Sniffed, path: Path, options: IngestOptions, ctx: StageContext) -> Found:
-    if sniffed.kind == "video":
+    """What is in the upload, checked and written, with a word on what was not used."""
+    importer = importer_of(sniffed.kind)
+    if importer.brings == "film":
         return video.read(path, options, ctx)
-    if sniffed.kind == "images":
-        return images.read(path, options, ctx)
-    return _POSED_READERS[sniffed.kind](path, str(sniffed.details["root"]), options, ctx)
+    limits = ArchiveLimits(max_unpacked_bytes=options.max_unpacked_bytes)
+    with CaptureArchive(path, limits) as archive:
+        contents = load_reader(importer)(archive, sniffed.claim)
+        try:
+            if isinstance(contents, PosedPictures):
+                found = write_posed(archive, contents, sniffed.kind, options, ctx)
+            else:
+                found = write_photos(archive, contents, options, ctx)
+        except CaptureError as error:
+            if error.code not in ("too_few_images", "no_images"):
+                raise
+            raise _with_leftovers(error, archive) from error
+        left = leftovers(archive)
+    return Found(
+        images=found.images,
+        details={**found.details, **as_details(left)},
+        warnings=found.warnings + leftover_warnings(left),
+    )
+
+
+def _with_leftovers(error: CaptureError, archive: CaptureArchive) -> CaptureError:
+    """The error that too few pictures are left, and what became of the others."""
+    told = leftover_warnings(leftovers(archive))
+    return CaptureError(
+        " ".join([error.message, *told]),
+        code=error.code,
+        hint=error.hint,
+        details={**error.details, "not_used": told},
+    )
 
 
 def _filename(ctx: StageContext) -> str:

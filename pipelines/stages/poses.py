@@ -2,8 +2,10 @@
 
 Reads the images of `frames` (videos) or `ingest` (photos). Writes cameras.json (registered images
 only, gravity along -Z, cameras in [-1, 1]^3), points.ply (sparse, coloured, same frame) and
-report.json (what registered, what did not and why, every attempt made). The parts: `pipelines.sfm`
-(which images, which pairs, attempts, verdict), `pipelines.tools.colmap`, `pipelines.orientation`.
+report.json (what registered, what did not and why, every attempt made, which lens and how well it
+is known); where no usable poses are found, report.json alone. The parts: `pipelines.sfm` (which
+images, which pairs, attempts, verdict, lenses), `pipelines.tools.colmap`,
+`pipelines.scene.orientation`.
 """
 
 from __future__ import annotations
@@ -15,12 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.cameras_file import CamerasFile, PosedImage
+from pipelines.errors import PosesError, ToolError
+from pipelines.exports.formats.ply import write_points
 from pipelines.options import PosesOptions
-from pipelines.orientation import Normalisation, normalise, opengl_from_opencv
-from pipelines.ply import write_points
+from pipelines.scene.cameras_file import CamerasFile, PosedImage
+from pipelines.scene.orientation import Normalisation, normalise, opengl_from_opencv
 from pipelines.sfm.attempts import Checkpoint, Ladder
-from pipelines.sfm.report import build_report, check_usable
+from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses
+from pipelines.sfm.report import build_report, check_usable, report_of_failure, report_of_model
+from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source, read_source
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
@@ -33,10 +38,13 @@ _SUMMARY = (
     "num_images",
     "num_registered",
     "registered_ratio",
+    "metric",
     "mean_reprojection_error_px",
     "median_triangulation_angle_deg",
     "num_points",
     "num_cameras",
+    "intrinsics",
+    "warnings",
     "models",
     "gaps_s",
 )
@@ -52,24 +60,57 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     checkpoint = Checkpoint(ctx, source, options)
     with tempfile.TemporaryDirectory(prefix="poses-") as scratch:
         reconstructor = Reconstructor(
-            checkpoint.database,
+            checkpoint.database(RUNGS[0].matches.database),
             source.paths,
             Path(scratch),
             num_threads=options.num_threads,
             seed=ctx.seed,
         )
-        outcome = Ladder(reconstructor, checkpoint, source, options, ctx).climb()
-    model = check_usable(outcome, source, options)
+        ladder = Ladder(reconstructor, checkpoint, source, options, ctx)
+        try:
+            outcome = ladder.climb()
+            model = check_usable(outcome, source, options)
+        except (PosesError, ToolError) as error:
+            _write_report(ctx, report_of_failure(ladder.outcome, source, options, error))
+            raise
+        model, lenses = _settle_lenses(reconstructor, model, options, ctx)
     ctx.progress(0.99, "writing the poses", 1.0)
     poses = opengl_from_opencv(model.world_from_camera)
     world = normalise(poses, orient=options.orientation == "auto")
     notes = {"up_from": world.up_from, "centered_on": world.centered_on}
     write_cameras(ctx.out / "cameras.json", model, source, world, notes)
     write_sparse_points(ctx.out / "points.ply", model, world)
-    report = build_report(outcome, model, source, notes)
-    (ctx.out / "report.json").write_text(json.dumps(report, indent=1), "utf-8")
+    report = {**build_report(outcome, source), **report_of_model(model, lenses, notes)}
+    _write_report(ctx, report)
     ctx.progress(1.0, f"{len(model.indices)} of {len(source.files)} images registered", 0.0)
     return {key: report[key] for key in _SUMMARY}
+
+
+def _settle_lenses(
+    reconstructor: Reconstructor, model: SparseModel, options: PosesOptions, ctx: StageContext
+) -> tuple[SparseModel, tuple[LensVerdict, ...]]:
+    """The model with the lenses that fit it best, and what is known of each camera."""
+    trials = reconstructor.lens_trials(
+        model,
+        lambda: ctx.progress(0.98, "fitting the lens"),
+        refine_principal_point=options.refine_principal_point,
+    )
+    settled, lenses = settle_lenses(model, trials, options.camera_model)
+    for found in lenses:
+        ctx.logger.info(
+            "%d images: %s, focal length %.1f px (%s)",
+            found.num_images,
+            found.lens,
+            found.focal_px,
+            found.why,
+        )
+    for warning in lens_warnings(lenses):
+        ctx.logger.warning("%s %s", warning["message"], warning["hint"])
+    return settled, lenses
+
+
+def _write_report(ctx: StageContext, report: dict[str, Any]) -> None:
+    (ctx.out / "report.json").write_text(json.dumps(report, indent=1), "utf-8")
 
 
 def write_cameras(

@@ -1,27 +1,38 @@
 """The report stage: `report.json`, the whole job in one file.
 
-Fixed keys, for programs: capture.kind, poses.num_images, poses.num_registered,
-poses.registered_ratio, metrics.psnr, metrics.ssim, metrics.num_images, metrics.width,
-metrics.height, metrics.per_image[], metrics.protocol {name, split, fit_poses, fit_appearance,
-train_camera_optimizer, train_appearance, description}, metrics.lpips and metrics.floaters (null
-with a metrics.lpips_reason or metrics.floaters_reason where they were not measured),
+Fixed keys, for programs: state (succeeded, failed), error (null, or stage, code, message, hint,
+details), capture.kind, poses.num_images, poses.num_registered, poses.registered_ratio, poses.metric
+(whether one unit is a metre; null where that is unknown), metrics.psnr, metrics.ssim,
+metrics.num_images, metrics.width, metrics.height, metrics.per_image[], metrics.protocol
+{name, split, fit_poses, fit_appearance, train_camera_optimizer, train_appearance, description},
+metrics.lpips and metrics.floaters (null with a metrics.lpips_reason or
+metrics.floaters_reason where they were not measured),
+assets.mesh and assets.cloud {coverage, psnr, ssim, psnr_with_holes}, assets.depth_agreement and
+assets.depth (null with a reason), assets.views {held_out, num_views, width, height, note},
+warnings[] {code, message, hint, details},
 timings.<stage>_s, options, versions, artifacts[] {name, bytes, sha256}. Everything else may grow.
 
 All of it comes from the manifests of the stages before; nothing is measured here.
+
+A job that failed has a report.json, too (`write_failed_report`): what its stages found before one
+failed, that one's error, and under failed_report what it said itself; metrics are null then.
 """
 
 from __future__ import annotations
 
 import json
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from pipelines.captures.record import CaptureRecord
+from pipelines.captures.record import CAPTURE_JSON, CaptureRecord
 from pipelines.errors import ExportError
 from pipelines.manifest import versions
 from pipelines.options import ReportOptions
-from pipelines.registry import STAGES
-from pipelines.stage import StageContext
-from pipelines.workspace import Workspace
+from pipelines.registry import STAGE_NAMES, STAGES
+from pipelines.stage import REPORT, StageContext
+from pipelines.workspace import MANIFEST, Workspace
 
 REPORT_VERSION = 1
 
@@ -32,7 +43,7 @@ def run(options: ReportOptions, ctx: StageContext) -> dict[str, Any]:
     """Write `report.json`. The summary is its headline numbers. Raises ExportError for a missing
     manifest of a stage that every job has."""
     del options
-    manifests = _manifests(ctx.workspace)
+    manifests = manifests_of(ctx.workspace)
     for name in ("ingest", "train", "evaluate"):
         if name not in manifests:
             raise ExportError(
@@ -41,18 +52,19 @@ def run(options: ReportOptions, ctx: StageContext) -> dict[str, Any]:
                 hint=f"Run {name} first.",
             )
     report = build_report(manifests, CaptureRecord.load(ctx.workspace.stage("ingest")))
-    (ctx.out / "report.json").write_text(json.dumps(report, indent=1), "utf-8")
+    (ctx.out / REPORT).write_text(json.dumps(report, indent=1), "utf-8")
     ctx.progress(1.0, "report written", 0.0)
     return {
         "capture_kind": report["capture"]["kind"],
         "registered_ratio": report["poses"]["registered_ratio"],
         "psnr": report["metrics"]["psnr"],
         "ssim": report["metrics"]["ssim"],
+        "num_warnings": len(report["warnings"]),
         "num_artifacts": len(report["artifacts"]),
     }
 
 
-def _manifests(workspace: Workspace) -> Manifests:
+def manifests_of(workspace: Workspace) -> Manifests:
     """Manifests of the stages before this one, skipped ones left out."""
     return {
         stage.name: workspace.manifest(stage.name)
@@ -62,10 +74,13 @@ def _manifests(workspace: Workspace) -> Manifests:
 
 
 def build_report(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]:
-    """The content of `report.json`."""
-    evaluated = manifests["evaluate"]["summary"]
+    """The content of `report.json`, of a job whose stages all succeeded so far."""
+    evaluated = manifests.get("evaluate", {}).get("summary", {})
+    assessed = manifests.get("assess", {}).get("summary", {})
     return {
         "version": REPORT_VERSION,
+        "state": "succeeded",
+        "error": None,
         "capture": {
             "kind": capture.kind,
             "filename": capture.filename,
@@ -93,11 +108,20 @@ def build_report(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]
                 "per_image",
             )
         },
+        "assets": {key: value for key, value in assessed.items() if key != "warnings"} or None,
+        "warnings": [
+            *manifests.get("poses", {}).get("summary", {}).get("warnings", []),
+            *assessed.get("warnings", []),
+        ],
         "timings": {f"{name}_s": item["timings"]["wall_s"] for name, item in manifests.items()},
-        "stages": {name: item["summary"] for name, item in manifests.items() if name != "evaluate"},
+        "stages": {
+            name: item["summary"]
+            for name, item in manifests.items()
+            if name not in ("evaluate", "assess")
+        },
         "options": {name: item["options"] for name, item in manifests.items()},
         "versions": versions(),
-        "seed": manifests["train"].get("seed"),
+        "seed": next((item.get("seed") for item in manifests.values()), None),
         "artifacts": _artifacts(manifests),
     }
 
@@ -114,9 +138,9 @@ def _poses(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]:
         source = "structure from motion"
         num_images, num_registered = int(found["num_images"]), int(found["num_registered"])
     else:
-        found, source = {}, "capture"
-        trained = manifests["train"]["summary"]
-        num_registered = int(trained["num_train"]) + int(trained["num_test"])
+        found, source = {"metric": capture.details.get("metric")}, "capture"
+        trained = manifests.get("train", {}).get("summary", {})
+        num_registered = int(trained.get("num_train", 0)) + int(trained.get("num_test", 0))
         num_images = max(num_registered, _pictures_in(capture))
     return {
         **found,
@@ -148,3 +172,52 @@ def _artifacts(manifests: Manifests) -> list[dict[str, Any]]:
                     {"name": artifact.name, "bytes": item["bytes"], "sha256": item["sha256"]}
                 )
     return found
+
+
+def write_failed_report(
+    path: Path,
+    workspace: Workspace,
+    manifests: Manifests,
+    stage: str,
+    error: Mapping[str, Any],
+) -> None:
+    """Write `report.json` of a job that ends with the error of a stage.
+
+    manifests: of the stages that succeeded. error: as `PipelineError.as_dict` gives it.
+    """
+    own = workspace.failed(stage) / REPORT
+    said = json.loads(own.read_text("utf-8")) if own.is_file() else None
+    report = build_report(manifests, _capture_of(workspace))
+    if stage == "poses" and said is not None:
+        report["poses"] = {
+            key: said[key] for key in ("num_images", "num_registered", "registered_ratio", "metric")
+        } | {"source": "structure from motion", "advice": said["advice"]}
+    shown = {key: error[key] for key in ("code", "message", "hint", "details") if key in error}
+    report |= {"state": "failed", "error": {"stage": stage, **shown}, "failed_report": said}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    draft.write_text(json.dumps(report, indent=1), "utf-8")
+    draft.replace(path)
+
+
+def write_failed_report_locally(workspace: Workspace, stage: str, error: Mapping[str, Any]) -> Path:
+    """The same for a job on a local folder, as `report/report.json` without a manifest.
+
+    What stands behind the failed stage is left out: it belongs to an earlier run.
+    """
+    folder = workspace.stage("report")
+    (folder / MANIFEST).unlink(missing_ok=True)
+    before = STAGE_NAMES[: STAGE_NAMES.index(stage)]
+    manifests = {name: item for name, item in manifests_of(workspace).items() if name in before}
+    write_failed_report(folder / REPORT, workspace, manifests, stage, error)
+    return folder / REPORT
+
+
+def _capture_of(workspace: Workspace) -> CaptureRecord:
+    """What ingest found; where that is not here, what the job was told of the upload."""
+    if (workspace.stage("ingest") / CAPTURE_JSON).is_file():
+        return CaptureRecord.load(workspace.stage("ingest"))
+    job = {"kind": "", "filename": ""}
+    if workspace.job_file.is_file():
+        job |= json.loads(workspace.job_file.read_text("utf-8"))
+    return CaptureRecord(str(job["kind"]), str(job["filename"]), "")

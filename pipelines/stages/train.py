@@ -1,9 +1,9 @@
 """The train stage: fit the model to the posed images.
 
-Reads `cameras.json` of `poses` or `ingest` and the images beside it. Writes `model.zip` (all that
-is needed to render again without the capture), `cameras.json` (world frame; training cameras as
-training corrected them, held-out ones as they came) and `previews/`, pictures of a held-out view as
-training goes on. Goes on from its checkpoint after a failed attempt.
+Reads `cameras.json` of `poses` or `ingest`, the images beside it and the maps of `depth`. Writes
+`model.zip` (all that is needed to render again without the capture), `cameras.json` (world frame;
+training cameras as training corrected them, held-out ones as they came) and `previews/`, pictures
+of a held-out view as training goes on. Goes on from its checkpoint after a failed attempt.
 """
 
 from __future__ import annotations
@@ -20,30 +20,32 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.camera_path import natural_key
-from pipelines.cameras_file import CamerasFile, PosedImage
+from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.errors import TrainingError
-from pipelines.nerf.camera_optimizer import CameraOptimizer, se3_exp, so3_exp
-from pipelines.nerf.cameras import Cameras, SceneTransform
-from pipelines.nerf.checkpoint import load_checkpoint, save_model
-from pipelines.nerf.config import TrainConfig
-from pipelines.nerf.data import ImageData, load_images, split_indices
+from pipelines.nerf.data.depth_maps import DepthMaps
+from pipelines.nerf.data.images import ImageData, load_images, split_indices
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
+from pipelines.nerf.options.train import TrainConfig
 from pipelines.nerf.renderer import Renderer
-from pipelines.nerf.training import TrainProgress, train
-from pipelines.nerf.training_state import choose_device, is_fast
-from pipelines.options import StageOptions, resolve_options, stage_options, train_config
-from pipelines.stage import StageContext
-from pipelines.trained_scene import (
+from pipelines.nerf.space.camera_optimizer import CameraOptimizer, se3_exp, so3_exp
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
+from pipelines.nerf.training.checkpoint import load_checkpoint, save_model
+from pipelines.nerf.training.loop import TrainProgress, train
+from pipelines.nerf.training.state import choose_device, is_fast
+from pipelines.option_models import StageOptions
+from pipelines.options import resolve_options, stage_options, train_config
+from pipelines.scene.cameras_file import CamerasFile, PosedImage
+from pipelines.scene.depth_maps_file import DepthMapsFile
+from pipelines.scene.natural_order import natural_key
+from pipelines.scene.trained_scene import (
     as_uint8,
-    cameras_as_json,
     nerf_cameras,
     nerf_errors_as,
     use_all_cores,
 )
+from pipelines.stage import StageContext
 
-MIN_IMAGES = 4
 _PREVIEW_LONG_SIDE = 320
 _PSNR_STEPS = 50
 _CHECKPOINT, _PROGRESS = "training.pt", "progress.json"
@@ -52,7 +54,10 @@ _TRAIN_SHARE = 0.98
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What training sees. capture: sorted by name, with the split marked."""
+    """What training sees.
+
+    capture: sorted by name, with the split marked. depth: of the images that are trained on.
+    """
 
     capture: CamerasFile
     cameras: Cameras
@@ -60,6 +65,7 @@ class _Inputs:
     train: list[int]
     test: list[int]
     scene: SceneTransform
+    depth: DepthMaps | None
 
 
 def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
@@ -77,7 +83,7 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     capture.save(ctx.out / "cameras.json")
     width, height = _typical_size(inputs.images)
     extras = {
-        "cameras": cameras_as_json(capture),
+        "cameras": capture.as_dict(),
         "train": asdict(config),
         "width": width,
         "height": height,
@@ -99,7 +105,7 @@ def preload() -> None:
     """Load compiled kernels, so that the first run of this process need not: for idle moments."""
     config = train_config(stage_options("train", resolve_options("preview", {})["train"]))
     if _uses_kernels(config):
-        from pipelines.nerf.kernels.warm import load_compiled
+        from pipelines.nerf.compiling import load_compiled
 
         load_compiled(config)
 
@@ -111,7 +117,7 @@ def _compile_kernels(config: TrainConfig, ctx: StageContext) -> None:
     """
     if _uses_kernels(config):
         # Imported here: a machine that trains on a GPU never loads the compiler.
-        from pipelines.nerf.kernels.warm import compile_kernels
+        from pipelines.nerf.compiling import compile_kernels
 
         def on_progress(done: int, known: int) -> None:
             count = f" {done}/{known}" if known else ""
@@ -129,9 +135,9 @@ def _load(config: TrainConfig, ctx: StageContext) -> _Inputs:
     """Images and cameras at the training size, the split, and the scene's place in the world."""
     given = CamerasFile.load(ctx.workspace.posed_cameras)
     ordered = tuple(sorted(given.images, key=lambda image: natural_key(image.file)))
-    if len(ordered) < MIN_IMAGES:
+    if len(ordered) < MIN_POSED_IMAGES:
         raise TrainingError(
-            f"{len(ordered)} posed images are too few to train on, at least {MIN_IMAGES} are "
+            f"{len(ordered)} posed images are too few to train on, at least {MIN_POSED_IMAGES} are "
             "needed.",
             code="too_few_images",
             hint="Send a longer video or more photos, with overlap.",
@@ -154,7 +160,31 @@ def _load(config: TrainConfig, ctx: StageContext) -> _Inputs:
         [None if image.mask is None else _inside(root, image.mask) for image in marked],
         max_bytes=int(config.data.max_memory_gib * 2**30),
     )
-    return _Inputs(capture, cameras, images, train_indices, test_indices, scene)
+    depth = _depth_maps([marked[index].file for index in train_indices], scene, config, ctx)
+    return _Inputs(capture, cameras, images, train_indices, test_indices, scene, depth)
+
+
+def _depth_maps(
+    files: list[str], scene: SceneTransform, config: TrainConfig, ctx: StageContext
+) -> DepthMaps | None:
+    """The maps of the stage `depth`, of the images that are trained on, or None without any."""
+    if config.depth.weight == 0.0 or not ctx.workspace.is_complete("depth"):
+        return None
+    held = DepthMapsFile(ctx.workspace.stage("depth"))
+    if len(held) == 0:
+        return None
+    if [image.file for image in held.images] != files:
+        raise TrainingError(
+            "The depth maps are not those of the images that are trained on.",
+            code="depth_maps_outdated",
+            hint="Run depth again with the same train.data: maps must not know held-out images.",
+        )
+    lenses = [image.lens for image in held.images]
+    return DepthMaps.from_arrays(
+        [found.z for _, found in held],
+        [(lens.fl_x, lens.fl_y, lens.cx, lens.cy) for lens in lenses],
+        scene.scale,
+    )
 
 
 def _inside(root: Path, relative: str) -> Path:
@@ -198,6 +228,7 @@ def _fit(inputs: _Inputs, config: TrainConfig, ctx: StageContext, watcher: _Watc
         inputs.train,
         config,
         seed=ctx.seed,
+        depth=inputs.depth,
         checkpoint_path=ctx.checkpoint / _CHECKPOINT,
         on_progress=watcher.on_progress,
         on_preview=watcher.on_preview,
@@ -232,6 +263,8 @@ class _Watcher:
             "rays_per_s": round(progress.rays_per_s, 1),
             "elapsed_s": round(progress.elapsed_s, 2),
         }
+        if progress.loss_scale is not None:
+            self._last["loss_scale"] = progress.loss_scale
         message = f"step {progress.step}/{progress.max_steps}, {psnr:.1f} dB"
         self._ctx.progress(_TRAIN_SHARE * progress.fraction, message, progress.eta_s)
 

@@ -17,18 +17,20 @@ Axes here are COLMAP's: cameras look along +Z, +Y down. Pixel centres lie at (0.
 from __future__ import annotations
 
 import copy
-import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from PIL import Image
 
 from pipelines.errors import ToolError
+from pipelines.tools.colmap_lenses import LensTrials
 from pipelines.tools.colmap_results import (
     PairStatistics,
     SparseModel,
@@ -57,10 +59,15 @@ PER_IMAGE, SINGLE = pycolmap.CameraMode.PER_IMAGE, pycolmap.CameraMode.SINGLE
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """Images, by index, that share one lens."""
+    """Images, by index, that share one lens.
+
+    lens: COLMAP's camera model. focal_px: known beforehand, or None; COLMAP then starts from it,
+    and verifies pairs of images by a calibrated geometry.
+    """
 
     indices: tuple[int, ...]
     lens: str
+    focal_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,17 +87,32 @@ class FeatureSettings:
 
 
 @dataclass(frozen=True)
+class Thresholds:
+    """What incremental mapping demands before it believes; the defaults are COLMAP's.
+
+    min_num_matches: verified matches for a pair to count. init_*: of the pair that a model starts
+    from. pose_*: of the points by which an image is placed.
+    """
+
+    min_num_matches: int = 15
+    init_min_angle_deg: float = 16.0
+    init_min_num_inliers: int = 100
+    pose_min_num_inliers: int = 30
+    pose_min_inlier_ratio: float = 0.25
+
+
+@dataclass(frozen=True)
 class MapperSettings:
     """How incremental mapping goes about it.
 
     thorough: bundle adjustment as often as COLMAP does by default, instead of after each growth by
-    40 %. relaxed: lower thresholds, for captures that the defaults fail on.
+    40 %. thresholds: lower ones are for captures that COLMAP's fail on.
     """
 
     refine_focal: bool = True
     refine_principal_point: bool = False
     thorough: bool = False
-    relaxed: bool = False
+    thresholds: Thresholds = field(default_factory=Thresholds)
 
 
 def extraction_threads(settings: FeatureSettings, memory_mb: int, num_processors: int) -> int:
@@ -160,6 +182,7 @@ class Reconstructor:
         for group in groups:
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = group.lens
+            reader.camera_params = self._prior_params(group)
             for first in range(0, len(group.indices), step):
                 portion = group.indices[first : first + step]
                 names = [self.names[index] for index in portion]
@@ -231,9 +254,7 @@ class Reconstructor:
 
         watch: receives the number of images placed so far.
         """
-        output = self.scratch / "models"
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir(parents=True)
+        output = Path(tempfile.mkdtemp(prefix="models-", dir=self.scratch))
         options = self._mapping_options(settings)
         placed = [0]
 
@@ -252,7 +273,25 @@ class Reconstructor:
             ),
             lambda: watch(min(placed[0], len(self.names))),
         )
-        return [sparse_model(model) for model in found.values() if model.num_reg_images() > 1]
+        return [
+            sparse_model(model, output / str(number))
+            for number, model in found.items()
+            if model.num_reg_images() > 1
+        ]
+
+    def lens_trials(
+        self, model: SparseModel, poll: Callable[[], None], *, refine_principal_point: bool
+    ) -> LensTrials:
+        """Trials of other lenses on a model that `map` found. poll: what it raises ends a trial."""
+        if model.stored is None:
+            raise ValueError("the model was not written by COLMAP")
+        return LensTrials(
+            model.stored,
+            refine_principal_point=refine_principal_point,
+            num_threads=self.num_threads,
+            seed=self.seed,
+            run=lambda what, call: self._run(what, call, poll),
+        )
 
     def statistics(self) -> PairStatistics:
         """What extraction and matching put into the database. Not while another call runs."""
@@ -274,13 +313,26 @@ class Reconstructor:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = _QUICK_GROWTH
             options.ba_global_max_refinements = 2
             options.ba_local_max_refinements = 1
-        if settings.relaxed:
-            options.min_num_matches = 10
-            options.mapper.init_min_tri_angle = 4.0
-            options.mapper.init_min_num_inliers = 50
-            options.mapper.abs_pose_min_num_inliers = 15
-            options.mapper.abs_pose_min_inlier_ratio = 0.15
+        wanted = settings.thresholds
+        options.min_num_matches = wanted.min_num_matches
+        options.mapper.init_min_tri_angle = wanted.init_min_angle_deg
+        options.mapper.init_min_num_inliers = wanted.init_min_num_inliers
+        options.mapper.abs_pose_min_num_inliers = wanted.pose_min_num_inliers
+        options.mapper.abs_pose_min_inlier_ratio = wanted.pose_min_inlier_ratio
         return options
+
+    def _prior_params(self, group: CameraGroup) -> str:
+        """Parameters of the group's camera where its focal length is known, as COLMAP reads them.
+
+        Their presence makes COLMAP set `has_prior_focal_length`.
+        """
+        if group.focal_px is None:
+            return ""
+        with Image.open(self.links / self.names[group.indices[0]]) as image:
+            camera = pycolmap.Camera.create_from_model_name(
+                0, group.lens, group.focal_px, *image.size
+            )
+        return ",".join(f"{value:.6f}" for value in camera.params)
 
     def _camera_of(self, name: str) -> int:
         """COLMAP's id of the camera of an image in the database; -1 where it was not readable."""

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from pipelines.cameras_file import Intrinsics
 from pipelines.errors import ToolError
+from pipelines.scene.cameras_file import Intrinsics
 
 _ANGLE_SAMPLE = 3000
 
@@ -56,6 +56,12 @@ class PairStatistics:
     num_verified: int
     homographies: npt.NDArray[np.float64]
 
+    @classmethod
+    def nothing(cls, num_images: int) -> PairStatistics:
+        """Before anything was looked at."""
+        none = np.zeros(num_images, np.int64)
+        return cls(none, none, 0, 0, np.zeros((0, 3, 3)))
+
 
 @dataclass(frozen=True)
 class SparseModel:
@@ -65,7 +71,7 @@ class SparseModel:
     camera_of: [N], index into `cameras`. world_from_camera: [N, 3, 4] float64, OpenCV axes.
     points: [P, 3] float64. colors: [P, 3] uint8. track_lengths: [P], images that see each point.
     error_px: mean reprojection error. angle_deg: median over points of the widest angle between
-    two of its rays; small where the camera hardly moved.
+    two of its rays; small where the camera hardly moved. stored: the folder it was written to.
     """
 
     indices: tuple[int, ...]
@@ -77,6 +83,7 @@ class SparseModel:
     track_lengths: npt.NDArray[np.int64]
     error_px: float
     angle_deg: float
+    stored: Path | None = None
 
 
 def best_model(models: Sequence[SparseModel]) -> SparseModel | None:
@@ -176,8 +183,8 @@ def image_index(name: str) -> int:
     return int(Path(name).stem)
 
 
-def sparse_model(reconstruction: Any) -> SparseModel:
-    """A `pycolmap.Reconstruction` as plain arrays."""
+def sparse_model(reconstruction: Any, stored: Path | None = None) -> SparseModel:
+    """A `pycolmap.Reconstruction` as plain arrays. stored: the folder that it was written to."""
     images = sorted(
         (reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()),
         key=lambda image: image_index(image.name),
@@ -200,6 +207,7 @@ def sparse_model(reconstruction: Any) -> SparseModel:
         track_lengths=np.array([point.track.length() for point in points], np.int64),
         error_px=float(reconstruction.compute_mean_reprojection_error()),
         angle_deg=_median_widest_angle_deg(points, center_of),
+        stored=stored,
     )
 
 

@@ -35,6 +35,10 @@ _ADVICE = {
     244: "The machine ran out of memory: use smaller pictures or a larger machine.",
     228: "The disk is full: free some space and try again.",
 }
+_YUV = ("yuv", "nv", "uyvy", "yuyv", "p0")
+_MATRICES = frozenset(
+    {"bt709", "fcc", "bt470bg", "smpte170m", "smpte240m", "ycgco", "bt2020nc", "bt2020c", "gbr"}
+)
 _FORMATS = "mov,matroska,avi"
 _MAX_ALLOC_BYTES = 2**31 - 1
 
@@ -49,6 +53,8 @@ class VideoInfo:
     fps: mean frames per second, None where the file does not say.
     duration_s: of the whole file, None where the file does not say.
     hdr: "none", "hlg", "pq", or "dolby" (Dolby Vision without a compatible base layer).
+    matrix: where the file does not name its colour matrix, ffmpeg's name of the one to assume.
+    projection: ffmpeg's name of a 360-degree projection, such as "equirectangular"; "" for none.
     num_frames: None unless counted.
     """
 
@@ -62,6 +68,8 @@ class VideoInfo:
     hdr: str
     pix_fmt: str
     color: str = ""
+    matrix: str | None = None
+    projection: str = ""
     num_frames: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -223,6 +231,7 @@ def parse_probe(container: str, lines: Sequence[str]) -> VideoInfo:
     width, height = _square_pixels(stream, width, height)
     if rotation in (90, 270):
         width, height = height, width
+    hdr = _hdr(color, side_data)
     return VideoInfo(
         container=container,
         codec=codec,
@@ -231,9 +240,11 @@ def parse_probe(container: str, lines: Sequence[str]) -> VideoInfo:
         rotation_deg=rotation,
         fps=_rate(stream),
         duration_s=_duration(text),
-        hdr=_hdr(color, side_data),
+        hdr=hdr,
         pix_fmt=pix_fmt,
         color=color,
+        matrix=_assumed_matrix(pix_fmt, color, width, height) if hdr == "none" else None,
+        projection=_projection(side_data),
     )
 
 
@@ -322,3 +333,22 @@ def _hdr(color: str, side_data: str) -> str:
         return "pq"
     dolby = re.search(r"DOVI configuration record:.*?profile: (\d+)", side_data)
     return "dolby" if dolby and dolby.group(1) == "5" else "none"
+
+
+def _assumed_matrix(pix_fmt: str, color: str, width: int, height: int) -> str | None:
+    """The matrix of Y'CbCr that names none: BT.709 for HD, BT.601 for less, as players do.
+
+    color: such as "tv, bt709", or "tv, unknown/bt709/bt709", where the matrix comes first.
+    """
+    if not pix_fmt.startswith(_YUV) or any(
+        part.strip().split("/")[0] in _MATRICES for part in color.split(",")
+    ):
+        return None
+    is_hd = max(width, height) >= 1280 or min(width, height) >= 720
+    return "bt709" if is_hd else "smpte170m"
+
+
+def _projection(side_data: str) -> str:
+    spherical = re.search(r"(?im)^\s*spherical(?: mapping)?: *([a-z][a-z -]*)", side_data)
+    name = spherical.group(1).strip().lower() if spherical else ""
+    return "" if name == "rectilinear" else name

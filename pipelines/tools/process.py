@@ -98,7 +98,7 @@ class Program:
         self._advice = dict(advice or {})
         self._log: deque[str] = deque(maxlen=LOG_LINES)
         self._callback_error: Exception | None = None
-        self._timed_out = threading.Event()
+        self._passed_limit_s: float | None = None
 
     def __enter__(self) -> Program:
         try:
@@ -119,7 +119,8 @@ class Program:
         self._log_thread.start()
         self._timer: threading.Timer | None = None
         if self._time_limit_s != _NO_LIMIT:
-            self._timer = threading.Timer(self._time_limit_s, self._on_time_limit)
+            limit = self._time_limit_s
+            self._timer = threading.Timer(limit, self._on_time_limit, [limit])
             self._timer.daemon = True
             self._timer.start()
         return self
@@ -130,7 +131,7 @@ class Program:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._kill()
+        self.kill()
         if self._timer:
             self._timer.cancel()
         self._log_thread.join()
@@ -151,8 +152,8 @@ class Program:
                 details={"log": list(self._log)},
             ) from None
 
-    def wait(self) -> ProgramResult:
-        """Close stdin and wait for the end.
+    def wait(self, at_most_s: float = _NO_LIMIT) -> ProgramResult:
+        """Close stdin and wait for the end, from now on at most so long.
 
         Raises ToolError for an exit code other than 0 or a passed time limit, Cancelled, and what
         a callback raised.
@@ -160,12 +161,15 @@ class Program:
         if self._process.stdin:
             _close_quietly(self._process.stdin)
         self._drain_stdout()
+        begun = time.monotonic()
         while True:
             try:
                 returncode = self._process.wait(_POLL_S)
                 break
             except subprocess.TimeoutExpired:
                 self._check_cancelled()
+                if time.monotonic() - begun > at_most_s:
+                    self._on_time_limit(at_most_s)
         self._log_thread.join()
         if self._callback_error is not None:
             raise self._callback_error
@@ -174,9 +178,9 @@ class Program:
 
     def _raise_for(self, returncode: int) -> None:
         log = list(self._log)
-        if self._timed_out.is_set():
+        if self._passed_limit_s is not None:
             raise ToolError(
-                f"{self._name} was stopped: it took longer than {self._time_limit_s:.0f} s.",
+                f"{self._name} was stopped: it took longer than {self._passed_limit_s:.0f} s.",
                 code="tool_timeout",
                 hint="Try a shorter or smaller input.",
                 details={"log": log},
@@ -192,15 +196,16 @@ class Program:
 
     def _check_cancelled(self) -> None:
         if self._is_cancelled():
-            self._kill()
+            self.kill()
             raise Cancelled(f"The job was cancelled while {self._name} was running.")
 
-    def _on_time_limit(self) -> None:
+    def _on_time_limit(self, limit_s: float) -> None:
         if self._process.poll() is None:
-            self._timed_out.set()
-            self._kill()
+            self._passed_limit_s = limit_s
+            self.kill()
 
-    def _kill(self) -> None:
+    def kill(self) -> None:
+        """End the program at once; a `write` that another thread waits in raises ToolError."""
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()

@@ -21,10 +21,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pipelines.nerf.ablations import ABLATIONS, ablated
-from pipelines.nerf.config import TrainConfig
-from pipelines.nerf.lpips import BACKBONES, lpips_if_configured
-from pipelines.nerf.training import train
+from pipelines.nerf.judging.lpips import BACKBONES, lpips_if_configured
+from pipelines.nerf.options.ablations import ABLATIONS, ablated
+from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.training.loop import train
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.machine import describe, heading
 from tests.benchmarks.scores import PictureDistance, Score, render_images, score
@@ -72,8 +72,7 @@ def measure_fitted(
     model: Any, capture: BenchmarkCapture, lpips: PictureDistance | None, seed: int
 ) -> tuple[dict[str, Score], dict[str, Score], dict[str, str]]:
     """(scores of whole images, of the halves not seen, the halves that were), all by image."""
-    from pipelines.nerf.evaluation_config import TestTimeConfig
-    from pipelines.nerf.test_time import (
+    from pipelines.nerf.judging.test_time import (
         LEFT,
         RIGHT,
         fit_appearance,
@@ -81,6 +80,7 @@ def measure_fitted(
         half_columns,
         other_half,
     )
+    from pipelines.nerf.options.evaluate import TestTimeConfig
 
     options = TestTimeConfig()
     posed = fit_poses(

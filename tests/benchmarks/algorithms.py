@@ -24,8 +24,8 @@ from typing import Any
 
 from PIL import Image
 
-from pipelines.nerf.checkpoint import load_model, save_model
-from pipelines.nerf.config import TrainConfig
+from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.training.checkpoint import load_model, save_model
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.chart import PALETTE, Point, Series, line_chart
 from tests.benchmarks.machine import describe, heading

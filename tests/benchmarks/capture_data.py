@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.nerf.cameras import Cameras, SceneTransform
-from pipelines.nerf.config import DataConfig, TrainConfig
-from pipelines.nerf.data import ImageData, load_images, split_indices
+from pipelines.nerf.data.images import ImageData, load_images, split_indices
 from pipelines.nerf.errors import NerfError
+from pipelines.nerf.options.train import DataConfig, TrainConfig
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
 
 Poses = NDArray[np.float64]
 

@@ -2,8 +2,8 @@
 
 Each compiled kernel against its plain twin, values and gradients: the norm of the difference over
 the norm of what is expected. Then whole training steps, one kernel at a time and as CUDA graphs
-(`gpu.self_check`). Inputs are random, of the paper's shapes. Works on any device where Triton's
-kernels run, the interpreter's CPU included.
+(`engines.gpu.self_check`). Inputs are random, of the paper's shapes. Works on any device where
+Triton's kernels run, the interpreter's CPU included.
 """
 
 from __future__ import annotations
@@ -14,10 +14,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipelines.nerf.config import HashGridConfig, NerfactoConfig, TrainConfig
-from pipelines.nerf.fields import MLP
-from pipelines.nerf.gpu.mlp import fused_mlp, has_room
-from pipelines.nerf.gpu.self_check import engine_errors, engine_problem, grid_gaps, relative_gap
+from pipelines.nerf.engines.gpu.parts.mlp import fused_mlp, has_room
+from pipelines.nerf.engines.gpu.self_check import (
+    engine_errors,
+    engine_problem,
+    grid_gaps,
+    relative_gap,
+)
+from pipelines.nerf.networks.fields import MLP
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.options.parts import HashGridConfig
+from pipelines.nerf.options.train import TrainConfig
 from tests.benchmarks.gpu_counts import mlp_widths
 from tests.benchmarks.tables import markdown_table
 

@@ -5,7 +5,7 @@ tensor between two kernels written once and read once. Symbols: R rays, S sample
 L levels, F features. Counted apart: `hbm_bytes` of tensors too large for the cache, `sectors` of
 32 bytes that scattered reads and additions of a hash grid ask of the L2 cache, `flops` of matrix
 products. What a grid's kernels do for a level and point is read off their machine code, which
-`tests/unit/pipelines/nerf/gpu/test_compile.py` pins: eight loads of two features, and eight
+`tests/unit/pipelines/nerf/engines/gpu/test_compile.py` pins: eight loads of two features, and eight
 additions of two features on GPUs that have those (sm_90 on), sixteen of one elsewhere.
 """
 
@@ -15,8 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from pipelines.nerf.config import HashGridConfig, NerfactoConfig, ProposalConfig
-from pipelines.nerf.encodings import level_layout
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, ProposalConfig
+from pipelines.nerf.options.parts import HashGridConfig
+from pipelines.nerf.space.hash_levels import level_layout
 
 SECTOR = 32
 CORNERS = 8

@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.nerf.cameras import Cameras, SceneTransform
-from pipelines.nerf.config import DataConfig
-from pipelines.nerf.data import ImageData, split_indices
-from pipelines.nerf.rays import Rays
+from pipelines.nerf.data.images import ImageData, split_indices
+from pipelines.nerf.options.train import DataConfig
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
+from pipelines.nerf.space.rays import Rays
 from tests.benchmarks.capture_data import BenchmarkCapture
 
 BALL_RADIUS = 0.35

@@ -33,14 +33,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pipelines.nerf.config import NerfactoConfig, TrainConfig
+from pipelines.nerf.engines.gpu.render import TileDrawer, can_draw
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.gpu.render import TileDrawer, can_draw
-from pipelines.nerf.metrics import psnr
+from pipelines.nerf.judging.metrics import psnr
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
-from pipelines.nerf.rays import Rays
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.options.train import TrainConfig
 from pipelines.nerf.renderer import Renderer
+from pipelines.nerf.space.rays import Rays
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.gpu_counts import (
     PAIRED_ADDITIONS_FROM,

@@ -15,14 +15,17 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from pipelines.nerf.cameras import Cameras
-from pipelines.nerf.config import ModelConfig, NerfactoConfig, TrainConfig, find_method
-from pipelines.nerf.data import PixelSampler
-from pipelines.nerf.fields import MLP
-from pipelines.nerf.gpu.step import TrainingStep, capturable_adam, loss_scaler
+from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.engines.gpu.step import TrainingStep, capturable_adam, loss_scaler
 from pipelines.nerf.models.base import Model
-from pipelines.nerf.training import train
-from pipelines.nerf.training_state import choose_device
+from pipelines.nerf.networks.fields import MLP
+from pipelines.nerf.options.catalogue import find_method
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.options.parts import ModelConfig
+from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.space.cameras import Cameras
+from pipelines.nerf.training.loop import train
+from pipelines.nerf.training.state import choose_device
 from tests.benchmarks.capture_data import BenchmarkCapture
 from tests.benchmarks.machine import wait_for_gpu
 from tests.benchmarks.phases import PhaseClock, watching
@@ -143,7 +146,7 @@ def kernel_times(run: Run) -> list[tuple[str, float]]:
 def network_times(model: ModelConfig, device: torch.device) -> dict[str, dict[str, float]]:
     """Seconds of the model's networks on 2^20 points, fused and layer by layer."""
     # Imported here: Triton has no wheel for every platform.
-    from pipelines.nerf.gpu.mlp import fused_mlp, has_room
+    from pipelines.nerf.engines.gpu.parts.mlp import fused_mlp, has_room
     from tests.benchmarks.gpu_checks import networks
 
     assert isinstance(model, NerfactoConfig)

@@ -87,7 +87,7 @@ def _line(varied: str, fixed: str, points: Sequence[MemoryPoint]) -> list[Line]:
 
 def measure_here(folder: Path, long_side: int, sampling: str, steps: int, rays: int) -> MemoryPoint:
     """Load and train in this process. What torch takes to be imported is in every figure."""
-    from pipelines.nerf.training import train
+    from pipelines.nerf.training.loop import train
     from tests.benchmarks.capture_data import load_capture
     from tests.benchmarks.machine import peak_memory_bytes
     from tests.benchmarks.train_speed import speed_config

@@ -17,7 +17,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from pipelines.nerf.config import TrainConfig, default_train_config, methods
+from pipelines.nerf.options.catalogue import methods
+from pipelines.nerf.options.train import TrainConfig, default_train_config
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.machine import describe, heading
 from tests.benchmarks.runs import Run, run_with_marks, warm_up

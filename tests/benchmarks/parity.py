@@ -16,8 +16,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from pipelines.nerf.checkpoint import save_model
-from pipelines.nerf.config import DataConfig, TrainConfig
+from pipelines.nerf.options.train import DataConfig, TrainConfig
+from pipelines.nerf.training.checkpoint import save_model
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.machine import describe, heading, peak_memory_bytes

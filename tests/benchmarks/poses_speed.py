@@ -29,12 +29,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.cameras_file import CamerasFile
 from pipelines.captures.sniff import sniff
 from pipelines.manifest import run_job_locally
 from pipelines.options import PRESETS
 from pipelines.sample.align import path_extent, similarity
 from pipelines.sample.film import film_capture
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
 from tests.benchmarks.machine import GIB, describe, heading
 from tests.benchmarks.poses_ways import DEFAULTS, OURS, PHASES, WAYS

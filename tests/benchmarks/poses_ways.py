@@ -23,8 +23,10 @@ import numpy as np
 import pycolmap
 
 from pipelines.options import PosesOptions, resolve_options
-from pipelines.orientation import opengl_from_opencv
+from pipelines.scene.orientation import opengl_from_opencv
 from pipelines.sfm.attempts import Checkpoint, Ladder
+from pipelines.sfm.intrinsics import settle_lenses
+from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source, read_source
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
@@ -107,14 +109,25 @@ def limited(source: Source, limit: int | None) -> Source:
 def our_way(
     source: Source, options: PosesOptions, work: Path, workspace: Workspace, phases: Phases
 ) -> tuple[SparseModel | None, Reconstructor]:
-    """The product's ladder of attempts, as the poses stage climbs it."""
+    """The product's ladder of attempts and its lens, as the poses stage finds them; the lens counts
+    as mapping."""
     ctx = StageContext("poses", workspace, work, work, on_progress=phases.on_progress)
     checkpoint = Checkpoint(ctx, source, options)
     reconstructor = Reconstructor(
-        checkpoint.database, source.paths, work, num_threads=options.num_threads
+        checkpoint.database(RUNGS[0].matches.database),
+        source.paths,
+        work,
+        num_threads=options.num_threads,
     )
-    outcome = Ladder(reconstructor, checkpoint, source, options, ctx).climb()
-    return outcome.chosen.best, reconstructor
+    model = Ladder(reconstructor, checkpoint, source, options, ctx).climb().chosen.best
+    if model is not None:
+        trials = reconstructor.lens_trials(
+            model,
+            lambda: phases.on_progress(0.98, "placing", None),
+            refine_principal_point=options.refine_principal_point,
+        )
+        model, _ = settle_lenses(model, trials, options.camera_model)
+    return model, reconstructor
 
 
 def default_way(source: Source, work: Path, threads: int, phases: Phases) -> SparseModel | None:

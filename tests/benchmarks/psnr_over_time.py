@@ -21,7 +21,7 @@ from typing import Any
 
 from PIL import Image
 
-from pipelines.nerf.config import TrainConfig
+from pipelines.nerf.options.train import TrainConfig
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.chart import BLACK, PALETTE, Point, Series, line_chart

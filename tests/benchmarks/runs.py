@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from pipelines.nerf.config import TrainConfig
-from pipelines.nerf.training import TrainProgress, train
+from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.training.loop import TrainProgress, train
 from tests.benchmarks.capture_data import BenchmarkCapture
 from tests.benchmarks.machine import wait_for_gpu
 from tests.benchmarks.scores import Score, evaluate

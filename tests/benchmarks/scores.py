@@ -13,10 +13,10 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from pipelines.nerf.cameras import Cameras
-from pipelines.nerf.metrics import psnr, ssim
-from pipelines.nerf.render_config import ALL_SAMPLES
+from pipelines.nerf.judging.metrics import psnr, ssim
+from pipelines.nerf.options.render import ALL_SAMPLES
 from pipelines.nerf.renderer import Renderer
+from pipelines.nerf.space.cameras import Cameras
 from tests.benchmarks.capture_data import BenchmarkCapture
 
 

@@ -1,7 +1,7 @@
 """Training options of the benchmarks: a preset, changed by `--set model.x=value`.
 
 Only the presets themselves come from `pipelines.options`, which wants pydantic; the paper's
-settings, the defaults of `pipelines.nerf.config`, need no more than `pipelines.nerf`.
+settings, the defaults of `pipelines.nerf.options.train`, need no more than `pipelines.nerf`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from pipelines.nerf.config import (
-    NerfactoConfig,
+from pipelines.nerf.errors import NerfError
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.options.train import (
     TrainConfig,
     config_from_dict,
     default_train_config,
     validate,
 )
-from pipelines.nerf.errors import NerfError
 
 SAMPLINGS = ("paper", "preview")
 

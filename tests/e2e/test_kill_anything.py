@@ -26,6 +26,7 @@ from tests.capture_writers import write_nerfstudio
 pytestmark = [pytest.mark.services, pytest.mark.slow]
 
 TINY: dict[str, Any] = {
+    "depth": {"long_side_px": 96, "num_planes": 32},
     "train": {
         "max_steps": 1200,
         "rays_per_step": 512,

@@ -16,7 +16,8 @@ from storage.db import Database
 from storage.jobs import StageSeed, create_job, ready_stage_ids, request_cancel
 from storage.keys import capture_content
 from storage.models import Job, StageRow, new_id
-from storage.objects import ObjectStore, open_object_store
+from storage.objects import ObjectStore
+from storage.open_objects import open_object_store
 from storage.queries import get_job
 from storage.queue import Bell
 from storage.records import create_capture, read_logs

@@ -23,6 +23,7 @@ from storage.queue import QUEUE_CPU
 from tests.services import RedisServer, S3Endpoint, free_port
 from tests.unit.api.conftest import (
     KEY,
+    NUM_ARTIFACTS,
     Service,
     finish_job,
     problem,
@@ -86,7 +87,7 @@ def test_whole_life_of_a_job_on_postgresql_and_s3(
             assert artifact.name in answer.headers["content-disposition"]
             assert answer.headers["content-type"] == artifact.media_type
         out = tmp_path / "out"
-        assert len(client.download(job.id, out)) == 8
+        assert len(client.download(job.id, out)) == NUM_ARTIFACTS
         assert all(path.read_bytes() == CONTENT for path in out.iterdir())
 
         client.delete_job(job.id)

@@ -63,6 +63,12 @@ def test_an_error_of_the_input_fails_the_job_at_once_with_its_code(engine: Engin
     assert (job.error["code"], job.error["stage"]) == ("no_images", "frames")
     assert {row.name: row.state for row in job.stages}["train"] == "cancelled"
     assert len(engine.notes("frames start")) == 1
+    failed = engine.stage(job.id, "frames")
+    report = json.loads(b"".join(engine.store.read(f"{failed.output_prefix}report.json")))
+    assert report["state"] == "failed"
+    assert (report["error"]["stage"], report["error"]["code"]) == ("frames", "no_images")
+    assert report["failed_report"] == {"said": "The plan says no."}
+    assert set(report["timings"]) == {"ingest_s"}
 
 
 def test_a_fault_of_ours_shows_no_path_but_leaves_its_trace_in_the_log(engine: Engine) -> None:
@@ -79,6 +85,19 @@ def test_a_retryable_error_is_tried_again(engine: Engine) -> None:
     job_id = engine.submit({"frames": {"fail_times": 1}})
     assert engine.wait_for(job_id, "succeeded", "failed").state == "succeeded"
     assert engine.stage(job_id, "frames").attempt == 2
+
+
+@pytest.mark.parametrize(("what", "processes"), [("gpu_lost_times", 2), ("fail_times", 1)])
+def test_a_lost_gpu_costs_the_process_and_not_the_job(
+    engine: Engine, what: str, processes: int
+) -> None:
+    """A process whose GPU does not answer any more is of no use to the next attempt."""
+    engine.start_worker()
+    job = engine.wait_for(engine.submit({"train": {what: 1}}), "succeeded", "failed")
+    assert job.state == "succeeded", job.error
+    started = engine.notes("train start")
+    assert len(started) == 2
+    assert len({line.split()[-1] for line in started}) == processes
 
 
 def test_cancel_stops_a_busy_stage_and_what_it_started(engine: Engine) -> None:
@@ -142,6 +161,11 @@ def test_a_stage_that_crashes_each_time_fails_the_job(engine: Engine) -> None:
     assert job.error is not None
     assert job.error["code"] == "worker_lost"
     assert len(engine.notes("train start")) == 3
+    train = engine.stage(job_id, "train")
+    report = json.loads(b"".join(engine.store.read(f"{train.output_prefix}report.json")))
+    assert (report["error"]["code"], report["failed_report"]) == ("worker_lost", None)
+    kept = list(engine.store.list(f"jobs/{job_id}/train/"))
+    assert kept == [f"{train.output_prefix}report.json"], "those of the first two crashes are gone"
 
 
 def test_a_killed_worker_takes_its_stage_process_along_and_its_next_self_resumes(

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.cameras_file import CamerasFile
 from pipelines.options import PosesOptions
 from pipelines.sample.align import similarity
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.stage import StageContext
 from pipelines.stages.poses import run
 from pipelines.workspace import Workspace
@@ -57,6 +57,10 @@ def test_fox_photos_agree_with_the_published_poses(captures: Path, tmp_path: Pat
     ingest_photos(tmp_path, captures / "photos-fox" / "images", 960)
     summary, cameras = find_poses(tmp_path, num_features=2048, max_image_px=960)
     assert summary["num_registered"] >= 48
+    lens = summary["intrinsics"]
+    assert lens["model"] in ("RADIAL", "OPENCV"), "the published lens has two radial terms"
+    assert lens["focal_px"] == pytest.approx(1375.0 * 960 / 1920, rel=0.01)
+    assert lens["focal_spread_percent"] < 3.0
     published = json.loads((captures / "photos-fox" / "transforms.json").read_text("utf-8"))
     pose_of = {Path(f["file_path"]).name: f["transform_matrix"] for f in published["frames"]}
     poses = np.array([image.world_from_camera for image in cameras.images])

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pipelines.errors import CaptureError, ToolError
+from pipelines.errors import CaptureError, ToolError, TrainingError
 from pipelines.stage import Stage, StageContext
 
 _HERE = "tests.integration.toy_stages"
@@ -80,9 +80,12 @@ def _misbehave(plan: dict[str, Any], ctx: StageContext, witness: Path) -> None:
         child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
         _note(witness, f"{ctx.stage} child {child.pid}")
     if plan.get("fail"):
+        (ctx.out / "report.json").write_text(json.dumps({"said": "The plan says no."}))
         raise CaptureError("The plan says no.", code="no_images", hint="Change the plan.")
     if earlier < plan.get("fail_times", 0):
         raise ToolError("The tool broke.", retryable=True)
+    if earlier < plan.get("gpu_lost_times", 0):
+        raise TrainingError("The GPU is gone.", code="gpu_lost", retryable=True)
     if earlier < plan.get("crash_times", 0):
         os.kill(os.getpid(), signal.SIGKILL)
     if plan.get("fault"):

@@ -15,10 +15,11 @@ from typing import Any, NotRequired, TypedDict
 import torch
 from torch import Tensor, nn
 
-from pipelines.nerf.camera_optimizer import CameraOptimizer
-from pipelines.nerf.config import ModelConfig
-from pipelines.nerf.encodings import HashGrid
-from pipelines.nerf.rays import Rays, RaySamples
+from pipelines.nerf.engines.hash_encoders import HASH_ENCODERS
+from pipelines.nerf.networks.encodings import HashGrid
+from pipelines.nerf.options.parts import ModelConfig
+from pipelines.nerf.space.camera_optimizer import CameraOptimizer
+from pipelines.nerf.space.rays import Rays, RaySamples
 
 Appearance = int | Tensor | None
 """Whose code to render with: a training image's, a code [A] itself, or None for the mean code."""
@@ -70,6 +71,7 @@ class Model(nn.Module, ABC):
     def __init__(self, config: ModelConfig, num_train_images: int) -> None:
         super().__init__()
         self.num_train_images = num_train_images
+        self.engine = "plain"
         self.cameras_delta = CameraOptimizer(
             num_train_images,
             config.camera_mode,
@@ -150,9 +152,10 @@ class Model(nn.Module, ABC):
 
     def set_engine(self, engine: str) -> None:
         """Choose "plain" or "fast"; both have the same values. By default, that of hash grids."""
+        self.engine = engine
         for module in self.modules():
             if isinstance(module, HashGrid):
-                module.engine = engine
+                module.encode = HASH_ENCODERS[engine]
 
     @property
     def appearance_dim(self) -> int:

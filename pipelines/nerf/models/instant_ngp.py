@@ -12,12 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pipelines.nerf.config import InstantNgpConfig, NerfactoConfig
-from pipelines.nerf.fields import NerfactoField
-from pipelines.nerf.losses import color_loss
-from pipelines.nerf.models.base import Appearance, Model, Outputs, StepPlan, hash_grid_bytes
-from pipelines.nerf.occupancy import SCENE_DIAGONAL, OccupancyGrid, Stride, march
-from pipelines.nerf.packed import (
+from pipelines.nerf.along_ray.losses import color_loss
+from pipelines.nerf.along_ray.occupancy import SCENE_DIAGONAL, OccupancyGrid, Stride, march
+from pipelines.nerf.along_ray.packed import (
     PackedSamples,
     packed_composite,
     packed_expected_depth,
@@ -26,7 +23,11 @@ from pipelines.nerf.packed import (
     packed_weights,
     sum_by_ray,
 )
-from pipelines.nerf.rays import Rays
+from pipelines.nerf.models.base import Appearance, Model, Outputs, StepPlan, hash_grid_bytes
+from pipelines.nerf.networks.fields import NerfactoField
+from pipelines.nerf.options.methods.instant_ngp import InstantNgpConfig
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.space.rays import Rays
 
 POINTS_PER_PASS = {"cpu": 2**15, "cuda": 2**20}
 """Points whose density is asked for at once without a graph, by kind of device."""

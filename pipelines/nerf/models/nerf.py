@@ -9,15 +9,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from pipelines.nerf.config import NerfConfig
-from pipelines.nerf.contraction import unit_from_scene
-from pipelines.nerf.fourier import FourierFeatures
-from pipelines.nerf.intervals import weights_from_density
-from pipelines.nerf.losses import color_loss
+from pipelines.nerf.along_ray.intervals import weights_from_density
+from pipelines.nerf.along_ray.losses import color_loss
+from pipelines.nerf.along_ray.rendering import accumulation, composite, expected_depth, median_depth
+from pipelines.nerf.along_ray.samplers import sample_along, sample_fine
 from pipelines.nerf.models.base import Appearance, Model, Outputs, StepPlan
-from pipelines.nerf.rays import Rays, RaySamples
-from pipelines.nerf.rendering import accumulation, composite, expected_depth, median_depth
-from pipelines.nerf.samplers import sample_along, sample_fine
+from pipelines.nerf.networks.fourier import FourierFeatures
+from pipelines.nerf.options.methods.nerf import NerfConfig
+from pipelines.nerf.space.contraction import unit_from_scene
+from pipelines.nerf.space.rays import Rays, RaySamples
 
 DENSITY_SHIFT = -1.0
 RESAMPLING_PADDING = 1e-5

@@ -12,28 +12,28 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pipelines.nerf.config import NerfactoConfig
-from pipelines.nerf.encodings import HashGrid
-from pipelines.nerf.fields import DensityField, NerfactoField
-from pipelines.nerf.intervals import sample_pdf, weights_from_density
-from pipelines.nerf.losses import (
+from pipelines.nerf.along_ray.intervals import sample_pdf, weights_from_density
+from pipelines.nerf.along_ray.losses import (
     color_loss,
     distortion_loss,
     interlevel_loss,
     orientation_loss,
     predicted_normal_loss,
 )
-from pipelines.nerf.models.base import Appearance, Model, Outputs, StepPlan, hash_grid_bytes
-from pipelines.nerf.normals import PredictedNormals, density_normals
-from pipelines.nerf.rays import Rays
-from pipelines.nerf.rendering import (
+from pipelines.nerf.along_ray.rendering import (
     accumulation,
     composite,
     composite_normals,
     expected_depth,
     median_depth,
 )
-from pipelines.nerf.samplers import anneal_exponent, sample_proposals, weigh_density
+from pipelines.nerf.along_ray.samplers import anneal_exponent, sample_proposals, weigh_density
+from pipelines.nerf.models.base import Appearance, Model, Outputs, StepPlan, hash_grid_bytes
+from pipelines.nerf.networks.encodings import HashGrid, hash_encode
+from pipelines.nerf.networks.fields import DensityField, NerfactoField
+from pipelines.nerf.networks.normals import PredictedNormals, normals_of_logits
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.space.rays import Rays
 
 ALWAYS_UPDATE_BEFORE = 10
 
@@ -61,7 +61,6 @@ class Nerfacto(Model):
         if config.predict_normals:
             self.normal_head = PredictedNormals(config.geo_feature_dim)
         self.steps_since_update = 0
-        self.engine = "plain"
 
     def round_networks(self) -> list[nn.Module]:
         """The proposal network of each round, in order; the same one each time where shared."""
@@ -93,16 +92,16 @@ class Nerfacto(Model):
     def set_engine(self, engine: str) -> None:
         """As `Model.set_engine`. Learned normals need second derivatives, which only plain has."""
         super().set_engine(engine)
-        self.engine = engine
         if self.normal_head is not None and self.field.hash_grid is not None:
-            self.field.hash_grid.engine = "plain"
+            self.field.hash_grid.encode = hash_encode
 
     def _kernels(self, where: Tensor) -> Any:
-        """The compiled parts (`kernels.engine`) for float32 tensors on the CPU, else None."""
+        """The compiled parts (`engines.cpu.train.twins`) for float32 tensors on the CPU, else
+        None."""
         if self.engine != "fast" or where.device.type != "cpu" or where.dtype != torch.float32:
             return None
         # Imported here: a machine that trains on a GPU never loads the compiler.
-        from pipelines.nerf.kernels import engine
+        from pipelines.nerf.engines.cpu.train import twins as engine
 
         return engine
 
@@ -138,12 +137,10 @@ class Nerfacto(Model):
                 resample=kernels.resample if kernels else sample_pdf,
             )
         codes = self._codes(rays, appearance, generator)
-        points = geometry = None
-        if kernels and self.normal_head is None and kernels.knows_field(self.field):
+        if kernels and kernels.knows_field(self.field):
             rgb, found = kernels.shade(self.field, rays, final, codes, config.background, generator)
         else:
-            points = final.positions(rays)
-            density, geometry = self.field.density(points)
+            density, geometry = self.field.density(final.positions(rays))
             colors = self.field.color(rays.directions, geometry, codes)
             found = weights_from_density(density, final.t_edges)
             rgb = composite(colors, found, config.background, generator=generator)
@@ -158,21 +155,32 @@ class Nerfacto(Model):
             weights=[*weights, found],
             samples=[*samples, final],
         )
-        if points is not None and geometry is not None and self.normal_head is not None:
-            self._add_normals(outputs, points, geometry, rays)
+        if self.normal_head is not None:
+            self._add_normals(outputs, rays, self.normal_head)
         return outputs
 
-    def _add_normals(self, outputs: Outputs, points: Tensor, geometry: Tensor, rays: Rays) -> None:
-        """Normals from density and predicted ones, per sample for the losses and per ray."""
-        assert self.normal_head is not None
+    def _add_normals(self, outputs: Outputs, rays: Rays, head: PredictedNormals) -> None:
+        """Normals from density and predicted ones, per sample for the losses and per ray.
+
+        One more pass through the density network, at points that are constants: no loss on normals
+        moves a camera, and the colours may come from a kernel, which keeps no features.
+        """
+        learns = self.training and torch.is_grad_enabled()
+        with torch.inference_mode(False), torch.enable_grad():
+            points = outputs["samples"][-1].positions(rays.detach()).clone().requires_grad_()
+            logits, geometry = self.field.logits(points)
+            # Only a loss on the density's own normals needs second derivatives, which are dear.
+            normals = normals_of_logits(
+                logits, points, create_graph=learns and self.config.orientation_weight > 0.0
+            )
+        if not learns:
+            normals, geometry = normals.detach(), geometry.detach()
+        predicted = head(self.field.unit(points.detach()), geometry)
         found = outputs["weights"][-1]
-        create_graph = self.training and torch.is_grad_enabled()
-        normals = density_normals(self.field.density_logits, points, create_graph=create_graph)
-        predicted = self.normal_head(self.field.unit(points).detach(), geometry)
         outputs["extra"] = {
             "normals": normals,
             "predicted_normals": predicted,
-            "directions": rays.directions,
+            "directions": rays.directions.detach(),
         }
         outputs["normals"] = composite_normals(normals.detach(), found.detach())
         outputs["predicted_normals"] = composite_normals(predicted.detach(), found.detach())
@@ -198,9 +206,10 @@ class Nerfacto(Model):
         if self.normal_head is not None:
             extra, fixed = outputs["extra"], weights.detach()
             normals, predicted = extra["normals"], extra["predicted_normals"]
-            losses["orientation"] = config.orientation_weight * orientation_loss(
-                fixed, normals, extra["directions"]
-            )
+            if config.orientation_weight > 0.0:
+                losses["orientation"] = config.orientation_weight * orientation_loss(
+                    fixed, normals, extra["directions"]
+                )
             losses["predicted_normal"] = config.predicted_normal_weight * predicted_normal_loss(
                 fixed, normals.detach(), predicted
             )

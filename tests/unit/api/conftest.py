@@ -93,6 +93,14 @@ class Service:
         ]
 
 
+WARNING = {
+    "code": "geometry_poor",
+    "message": "The surfaces do not hold together.",
+    "hint": "Film with more overlap.",
+    "details": {},
+}
+
+
 def run_stage(services: Services, job_id: str, name: str, files: dict[str, bytes]) -> None:
     """Do what a worker does for one ready stage: claim, publish, succeed."""
     with services.database.session_scope() as session:
@@ -108,9 +116,22 @@ def run_stage(services: Services, job_id: str, name: str, files: dict[str, bytes
         digest = hashlib.sha256(content).hexdigest()
         entries.append({"path": path, "bytes": len(content), "sha256": digest})
     summary = {"psnr": 25.5, "ssim": 0.9, "num_images": 7, "width": 480, "height": 270}
-    manifest = {"files": entries, "summary": summary if name == "evaluate" else {}}
+    assets = {
+        "mesh": {"coverage": 0.72, "psnr": 21.5, "ssim": 0.7, "psnr_with_holes": 14.0},
+        "cloud": {"coverage": 0.7, "psnr": 20.0, "ssim": 0.6, "psnr_with_holes": 13.0},
+        "depth": None,
+        "depth_agreement": None,
+        "warnings": [WARNING],
+        "per_view": [],
+    }
+    summaries = {"evaluate": summary, "assess": assets}
+    manifest = {"files": entries, "summary": summaries.get(name, {})}
     with services.database.session_scope() as session:
         succeed_stage(session, claim, manifest=manifest, output_prefix=prefix)
+
+
+NUM_ARTIFACTS = sum(len(stage.artifacts) for stage in STAGES)
+"""What a finished job has."""
 
 
 def finish_job(services: Services, job_id: str, content_of: Callable[[str], bytes]) -> None:

@@ -17,7 +17,16 @@ import pytest
 from rich.console import Console
 
 from api import cli
-from api.cli_display import clean, duration, print_results, quality_rows, size, watch_job
+from api.cli_display import (
+    clean,
+    duration,
+    print_job,
+    print_results,
+    print_warnings,
+    quality_rows,
+    size,
+    watch_job,
+)
 from api.client import Client
 from storage.jobs import stage_id
 from storage.leases import claim_stage, fail_stage, heartbeat
@@ -257,6 +266,39 @@ def test_bars_are_drawn_for_each_stage_on_a_terminal(command: LiveServer, archiv
         assert watch_job(client, job.id, console).state == "succeeded"
     for stage in job.stages:
         assert stage.name in screen.getvalue()
+
+
+def test_coverage_and_mesh_psnr_stand_beside_psnr_and_warnings_below(
+    command: LiveServer, archive: Path
+) -> None:
+    with Client() as client:
+        job = client.create_job(client.upload(archive).id)
+        finish_job(command.services, job.id, lambda _: b"x")
+        screen = io.StringIO()
+        print_job(client.get_job(job.id), Console(file=screen, width=120))
+    shown = screen.getvalue()
+    assert "25.50 dB" in shown
+    assert "72% of held-out views" in shown
+    assert "21.50 dB where it covers" in shown
+    assert "geometry_poor" in shown
+    assert "Film with more overlap." in shown
+
+    assets = {"mesh": {"coverage": 0.2, "psnr": None}}
+    rows = dict(quality_rows({**REPORT, "assets": assets}))
+    assert rows["mesh covers"] == "20% of held-out views"
+    assert rows["mesh PSNR"] == "not measured"
+    names = list(rows)
+    assert names.index("mesh covers") == names.index("held-out SSIM") + 1
+    assert "mesh covers" not in dict(quality_rows(REPORT))
+
+
+def test_a_warning_is_shown_with_its_advice_and_cannot_steer_the_terminal() -> None:
+    screen = io.StringIO()
+    warning = {"code": "geometry_poor", "message": "Bad [red]news\x1b[31m", "hint": "Do this."}
+    print_warnings([warning], Console(file=screen, width=120))
+    assert "geometry_poor" in screen.getvalue()
+    assert "Bad [red]news [31m" in screen.getvalue()
+    assert "Do this." in screen.getvalue()
 
 
 def test_results_show_what_was_not_measured(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ from storage.jobs import request_cancel
 from tests.services import free_port
 from tests.unit.api.conftest import (
     KEY,
+    NUM_ARTIFACTS,
     LiveServer,
     finish_job,
     settings_for,
@@ -128,7 +129,7 @@ def test_wait_returns_the_job_once_it_is_over(
     threading.Timer(0.5, lambda: finish_job(live.services, job.id, lambda name: b"x")).start()
     done = client.wait(job.id, on_update=lambda job: states.append(job.state), timeout=30)
     assert done.state == states[-1] == "succeeded"
-    assert len(done.artifacts) == 8
+    assert len(done.artifacts) == NUM_ARTIFACTS
 
 
 def test_wait_raises_for_a_job_that_did_not_succeed_where_asked(
@@ -189,7 +190,7 @@ def test_download_is_verified_whole_and_not_repeated(
     out = tmp_path / "out"
     paths = client.download(finished, out, progress=progress)
     assert sorted(path.name for path in out.iterdir()) == sorted(path.name for path in paths)
-    assert len(paths) == 8
+    assert len(paths) == NUM_ARTIFACTS
     assert all(path.read_bytes() == CONTENT for path in paths)
     assert set(seen.values()) == {(len(CONTENT), len(CONTENT))}
     before = {path: path.stat().st_mtime_ns for path in paths}

@@ -11,7 +11,7 @@ from pipelines.registry import STAGE_NAMES
 from storage.jobs import stage_id
 from storage.leases import Claim, claim_stage, fail_stage, heartbeat
 from storage.records import append_logs, register_worker
-from tests.unit.api.conftest import LEASE_S, Service, finish_job, problem, run_stage
+from tests.unit.api.conftest import LEASE_S, NUM_ARTIFACTS, Service, finish_job, problem, run_stage
 
 
 def claimed(service: Service, job_id: str, name: str) -> Claim:
@@ -35,11 +35,12 @@ def test_new_job_is_queued_with_all_its_stages(service: Service) -> None:
     assert float(answer.headers["retry-after"]) > 0
     assert set(job) == {
         *("id", "state", "preset", "preset_reason", "options", "labels", "capture_id", "stages"),
-        *("queue_position", "metrics", "error", "artifacts"),
+        *("queue_position", "metrics", "assets", "error", "artifacts"),
         *("created_at", "started_at", "finished_at", "cancel_requested_at"),
     }
     assert (job["state"], job["queue_position"], job["labels"]) == ("queued", 1, {"who": "me"})
-    assert (job["metrics"], job["error"], job["artifacts"]) == (None, None, [])
+    assert (job["metrics"], job["assets"], job["error"]) == (None, None, None)
+    assert job["artifacts"] == []
     assert job["options"] == resolve_options("preview", {})
     assert [stage["name"] for stage in job["stages"]] == list(STAGE_NAMES)
     assert set(job["stages"][0]) == {
@@ -140,7 +141,10 @@ def test_finished_job_has_metrics_and_no_retry_hint(service: Service) -> None:
         "width": 480,
         "height": 270,
     }
-    assert len(found["artifacts"]) == 8
+    assert found["assets"]["mesh"]["coverage"] == 0.72
+    assert found["assets"]["warnings"][0]["code"] == "geometry_poor"
+    assert "per_view" not in found["assets"]
+    assert len(found["artifacts"]) == NUM_ARTIFACTS
 
 
 def test_failed_job_says_what_to_do(service: Service) -> None:
@@ -225,7 +229,7 @@ def test_cancel_of_a_finished_job_is_a_conflict(service: Service) -> None:
 def test_deleted_job_is_gone_with_its_bytes_but_not_its_capture(service: Service) -> None:
     job = service.job()
     finish_job(service.services, job["id"], lambda name: b"x")
-    assert len(service.objects()) == 9
+    assert len(service.objects()) == 1 + NUM_ARTIFACTS
     path = f"/v1/jobs/{job['id']}"
     assert service.http.delete(path).status_code == 204
     assert len(service.objects()) == 1

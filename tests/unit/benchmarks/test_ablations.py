@@ -7,9 +7,11 @@ from dataclasses import fields, replace
 
 import pytest
 
-from pipelines.nerf.ablations import ABLATIONS, ablated
-from pipelines.nerf.config import ModelConfig, NerfactoConfig, TrainConfig, validate
 from pipelines.nerf.errors import NerfError
+from pipelines.nerf.options.ablations import ABLATIONS, ablated
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.options.parts import ModelConfig
+from pipelines.nerf.options.train import TrainConfig, validate
 from tests.benchmarks.ablations import Outcome, mean_score, size_config, table
 from tests.benchmarks.scores import Score
 

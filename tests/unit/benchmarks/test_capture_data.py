@@ -12,8 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pipelines.nerf.config import DataConfig, TrainConfig
 from pipelines.nerf.errors import NerfError
+from pipelines.nerf.options.train import DataConfig, TrainConfig
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import load_capture, upright_rotation
 from tests.benchmarks.made_capture import ring_pose, write_made_capture

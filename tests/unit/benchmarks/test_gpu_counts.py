@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipelines.nerf.config import HashGridConfig, NerfactoConfig
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.options.parts import HashGridConfig
 from tests.benchmarks.gpu_counts import (
     SECTOR,
     Device,

@@ -45,7 +45,7 @@ import argparse, json, sys
 from dataclasses import replace
 from pathlib import Path
 import torch
-from pipelines.nerf.gpu import self_check
+from pipelines.nerf.engines.gpu import self_check
 from pipelines.nerf.models.nerfacto import Nerfacto
 from tests.benchmarks import gpu_speed, gpu_training
 from tests.unit.pipelines.nerf.toy_scene import tiny_config

@@ -13,7 +13,18 @@ FOLDER = Path(benchmarks.__file__).parent
 ONLY_FOR_PRESETS = ("settings.py", "pipelines.options.PRESETS")
 
 # They measure the product around the NeRF, so they need all that it needs.
-OF_THE_WHOLE_PRODUCT = ("job_overhead.py", "poses_speed.py", "poses_ways.py")
+OF_THE_WHOLE_PRODUCT = (
+    "geometry.py",
+    "geometry_pictures.py",
+    "geometry_truth.py",
+    "job_overhead.py",
+    "poses_speed.py",
+    "poses_ways.py",
+    "scene_capture.py",
+    "stereo.py",
+    "tone_mapping.py",
+    "turntable.py",
+)
 
 
 def test_benchmarks_import_only_what_a_bare_machine_has() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipelines.nerf.cameras import SceneTransform
-from pipelines.nerf.config import default_train_config, validate
+from pipelines.nerf.options.train import default_train_config, validate
+from pipelines.nerf.space.cameras import SceneTransform
 from tests.benchmarks.capture_data import BenchmarkCapture
 from tests.benchmarks.methods import BOUNDED, SMALL, fitted, report, settings
 from tests.benchmarks.runs import Mark, Run

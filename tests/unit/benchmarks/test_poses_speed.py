@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.cameras_file import CamerasFile, Intrinsics, PosedImage
+from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.sfm.source import Source
 from tests.benchmarks.poses_speed import Measured, compare_poses, pose_errors, print_report
 from tests.benchmarks.poses_ways import Phases, described, limited

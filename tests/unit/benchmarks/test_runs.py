@@ -9,14 +9,10 @@ from functools import partial
 import pytest
 import torch
 
-from pipelines.nerf.config import (
-    DataConfig,
-    HashGridConfig,
-    NerfactoConfig,
-    ProposalConfig,
-    TrainConfig,
-)
-from pipelines.nerf.training import train
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, ProposalConfig
+from pipelines.nerf.options.parts import HashGridConfig
+from pipelines.nerf.options.train import DataConfig, TrainConfig
+from pipelines.nerf.training.loop import train
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.made_capture import write_made_capture
 from tests.benchmarks.phases import PhaseClock, watching

@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
-from pipelines.nerf.config import HashGridConfig, NerfactoConfig, ProposalConfig, TrainConfig
 from pipelines.nerf.errors import NerfError
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, ProposalConfig
+from pipelines.nerf.options.parts import HashGridConfig
+from pipelines.nerf.options.train import TrainConfig
 from pipelines.options import PRESETS
 from tests.benchmarks.settings import overridden, preset_config, sampling_model
 

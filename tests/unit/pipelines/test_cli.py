@@ -41,6 +41,21 @@ def test_run_all_reuses_what_is_current(tmp_path: Path, capsys: pytest.CaptureFi
     assert "ingest     is current" in capsys.readouterr().err
 
 
+def test_a_job_that_fails_leaves_its_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures = {f"{i}.jpg": picture(seed=i) for i in range(8)}
+    source = write_zip(tmp_path / "c.zip", pictures)
+    assert main(["run", "all", str(tmp_path / "job"), "--input", str(source)]) == 1
+    path = tmp_path / "job" / "report" / "report.json"
+    assert str(path) in capsys.readouterr().err
+    report = json.loads(path.read_text())
+    assert (report["state"], report["error"]["stage"]) == ("failed", "poses")
+    assert report["error"]["code"] == "no_features"
+    assert len(report["failed_report"]["unregistered"]) == 8
+    assert set(report["timings"]) == {"ingest_s"}
+
+
 @pytest.mark.parametrize(
     ("assignment", "says"),
     [

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pipelines.errors import CaptureError, PipelineError, ResourceError
+from pipelines.errors import Cancelled, CaptureError, PipelineError, ResourceError
 from pipelines.manifest import (
     RunHooks,
     file_sha256,
@@ -80,6 +80,29 @@ def test_out_is_empty_at_the_start_and_an_older_result_is_replaced(
         (folder / "old.txt").touch()
     run_stage(stage_of(write_hello), {}, workspace)
     assert not (workspace.stage("frames") / "old.txt").exists()
+
+
+def test_what_a_failed_stage_says_of_itself_is_kept_until_it_runs_again(
+    tmp_path: Path, stage_of: Callable[[Body], Stage]
+) -> None:
+    def fail(options: Any, ctx: StageContext) -> dict[str, Any]:
+        (ctx.out / "half.txt").touch()
+        (ctx.out / "report.json").write_text('{"why": 1}')
+        raise CaptureError("no")
+
+    def cancel(options: Any, ctx: StageContext) -> dict[str, Any]:
+        (ctx.out / "report.json").touch()
+        raise Cancelled("no more")
+
+    workspace = Workspace(tmp_path)
+    with pytest.raises(CaptureError):
+        run_stage(stage_of(fail), {}, workspace)
+    (kept,) = workspace.failed("frames").iterdir()
+    assert kept.read_text() == '{"why": 1}'
+    assert not workspace.partial("frames").exists()
+    with pytest.raises(Cancelled):
+        run_stage(stage_of(cancel), {}, workspace)
+    assert not workspace.failed("frames").exists()
 
 
 def test_failed_stage_leaves_the_checkpoint_and_nothing_else(
@@ -222,5 +245,5 @@ def test_result_with_changed_input_is_not_current(
 
 def test_missing_inputs_leave_out_skipped_stages(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path)
-    assert missing_inputs("train", "video", workspace) == ["ingest", "frames", "poses"]
-    assert missing_inputs("train", "polycam", workspace) == ["ingest"]
+    assert missing_inputs("train", "video", workspace) == ["ingest", "frames", "poses", "depth"]
+    assert missing_inputs("train", "polycam", workspace) == ["ingest", "depth"]

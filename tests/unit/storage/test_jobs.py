@@ -323,7 +323,7 @@ def test_a_cancelling_job_ends_cancelled_however_its_stage_ends(
         elif end == "crash":
             crash_stage(session, held, ERROR)
         elif end == "release":
-            release_stage(session, held)
+            assert release_stage(session, held) == "cancelled"
         else:
             assert reap_expired(session, when=seconds(1000)) == []
     assert look(database, job)["job"] == "cancelled"

@@ -18,9 +18,9 @@ from storage.objects import (
     SignedObject,
     check_key,
     make_object_token,
-    open_object_store,
     verify_object_token,
 )
+from storage.open_objects import open_object_store
 from storage.settings import StorageSettings
 
 KEY = b"signing key"

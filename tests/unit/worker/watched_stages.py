@@ -25,7 +25,7 @@ def run(options: Any, ctx: StageContext) -> dict[str, Any]:
     module, _, name = real_stage("train").run.partition(":")
     __import__(module)
     getattr(sys.modules[module], name)(options, ctx)
-    runtime = sys.modules["pipelines.nerf.kernels.runtime"]
+    runtime = sys.modules["pipelines.nerf.engines.cpu.parts.runtime"]
     loaded = sum(len(kernel.overloads) for kernel in runtime._launched)
     new = [name for name in sys.modules if name not in before]
     return {"pid": os.getpid(), "new_modules": new, "kernels": loaded}

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import PIL.Image
+from PIL.TiffImagePlugin import IFDRational
 
 from pipelines.stage import StageContext
 from pipelines.workspace import Workspace
@@ -29,6 +30,37 @@ def picture(
     stream = io.BytesIO()
     PIL.Image.fromarray(pixels).save(stream, kind, **save)
     return stream.getvalue()
+
+
+def phone_exif(focal_mm: float, focal_35mm: int, orientation: int = 1) -> PIL.Image.Exif:
+    """What a phone writes about a photo, with all that must not be kept."""
+    made = PIL.Image.Exif()
+    made[0x010F], made[0x0110], made[0x0112] = "Maker", "Phone 9", orientation
+    made[0x013B] = "Owner Ownerson"
+    detail = made.get_ifd(0x8769)
+    detail[0x920A], detail[0xA405] = IFDRational(round(focal_mm * 100), 100), focal_35mm
+    detail[0x9003], detail[0xA434] = "2024:05:06 07:08:09", f"back camera {focal_mm}mm"
+    detail[0xA431] = detail[0xA435] = "SERIAL-4711"
+    place = made.get_ifd(0x8825)
+    place[1], place[2] = "N", (48.0, 46.0, 31.0)
+    return made
+
+
+def exif(orientation: int) -> PIL.Image.Exif:
+    made = PIL.Image.Exif()
+    made[0x0112] = orientation
+    made[0x010F] = "Phone"
+    made.get_ifd(0x8825)[1] = "N"
+    return made
+
+
+def red_corner(path: Path) -> tuple[bool, bool]:
+    """Whether the red quarter is at the top, and whether it is at the left."""
+    with PIL.Image.open(path) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    red = (pixels[..., 0] - pixels[..., 1]) > 150
+    rows, columns = np.nonzero(red)
+    return bool(rows.mean() < red.shape[0] / 2), bool(columns.mean() < red.shape[1] / 2)
 
 
 def write_zip(path: Path, files: Mapping[str, bytes | str], method: int = 8) -> Path:

@@ -11,9 +11,9 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from pipelines.cameras_file import CamerasFile
 from pipelines.captures.sniff import sniff
 from pipelines.manifest import run_job_locally
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.captures.archives import write_zip
 
@@ -74,6 +74,39 @@ def test_fox_poses_pair_with_the_files_that_are_there(tmp_path: Path) -> None:
         np.testing.assert_allclose(
             image.world_from_camera, np.array(poses[stored["source"]])[:3], atol=1e-4
         )
+
+
+def test_blender_scene_is_posed_and_white_where_it_was_clear(tmp_path: Path) -> None:
+    folder = captures() / "blender-lego-reduced"
+    source = zip_of(tmp_path / "lego.zip", folder, [p for p in folder.rglob("*") if p.is_file()])
+    workspace, summary = prepared(tmp_path, source)
+    assert (summary["kind"], summary["num_images"], summary["warnings"]) == ("blender", 30, [])
+    file = CamerasFile.load(workspace.posed_cameras)
+    (lens,) = file.cameras
+    assert (lens.width, lens.cy, round(lens.fl_x, 2)) == (800, 400.0, 1111.11)
+    poses = np.array([image.world_from_camera for image in file.images])
+    # All cameras are 4.03 from the middle, above the ground, and look at the middle.
+    distances = np.linalg.norm(poses[:, :, 3], axis=1)
+    np.testing.assert_allclose(distances, 4.031, atol=1e-3)
+    assert (poses[:, 2, 3] > 0).all()
+    np.testing.assert_allclose(poses[:, :, 2], poses[:, :, 3] / distances[:, None], atol=1e-4)
+    with PIL.Image.open(workspace.images_root / file.images[0].file) as image:
+        assert (image.mode, image.getpixel((2, 2))) == ("RGB", (255, 255, 255))
+
+
+def test_scanner_export_gives_its_photos_and_no_depth(tmp_path: Path) -> None:
+    """3D Scanner App: pictures, 16-bit depth, 8-bit confidence and poses in one folder."""
+    folder = captures() / "3dscannerapp-corridor"
+    some = [p for p in folder.rglob("*") if p.is_file() and "_000" in p.name]
+    workspace, summary = prepared(tmp_path, zip_of(tmp_path / "scan.zip", folder, some))
+    record = json.loads((workspace.stage("ingest") / "capture.json").read_text())
+    assert all(Path(image["source"]).name.startswith("frame_") for image in record["images"])
+    assert summary["num_images"] == len(
+        [p for p in some if p.name.startswith("frame_0") and p.suffix == ".jpg"]
+    )
+    told = " ".join(record["warnings"])
+    for words in ("100 pictures", "16 bits", "confidence", "thumbnails", "3D Scanner App"):
+        assert words in told
 
 
 def test_fox_photos_alone_are_images(tmp_path: Path) -> None:

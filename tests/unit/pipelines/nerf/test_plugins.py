@@ -12,24 +12,19 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.nerf.cameras import Cameras
-from pipelines.nerf.checkpoint import load_model, save_model
-from pipelines.nerf.config import (
-    BUILT_IN_METHODS,
-    NerfactoConfig,
-    default_train_config,
-    find_method,
-    methods,
-    validate,
-)
-from pipelines.nerf.contraction import scene_from_unit, unit_from_scene
-from pipelines.nerf.data import ImageData
+from pipelines.nerf.along_ray.intervals import t_from_s
+from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.intervals import t_from_s
 from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.options.catalogue import BUILT_IN_METHODS, find_method, methods
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
+from pipelines.nerf.options.train import default_train_config, validate
 from pipelines.nerf.plugins import forget_plugins, plugin_components
 from pipelines.nerf.renderer import Renderer
-from pipelines.nerf.training import train
+from pipelines.nerf.space.cameras import Cameras
+from pipelines.nerf.space.contraction import scene_from_unit, unit_from_scene
+from pipelines.nerf.training.checkpoint import load_model, save_model
+from pipelines.nerf.training.loop import train
 from pipelines.options import OptionsError, resolve_options, train_config, train_options
 from tests.unit.pipelines.nerf.models.toy_runs import SCENE, same_state
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images
@@ -42,14 +37,14 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from pipelines.nerf.config import ModelConfig, option
-from pipelines.nerf.contraction import Contraction
-from pipelines.nerf.intervals import Spacing, weights_from_density
-from pipelines.nerf.losses import color_loss
+from pipelines.nerf.options.train import ModelConfig, option
+from pipelines.nerf.space.contraction import Contraction
+from pipelines.nerf.along_ray.intervals import Spacing, weights_from_density
+from pipelines.nerf.along_ray.losses import color_loss
 from pipelines.nerf.models.base import Model, Outputs
 from pipelines.nerf.plugins import Component, Method
-from pipelines.nerf.rendering import accumulation, composite, expected_depth, median_depth
-from pipelines.nerf.samplers import sample_along
+from pipelines.nerf.along_ray.rendering import accumulation, composite, expected_depth, median_depth
+from pipelines.nerf.along_ray.samplers import sample_along
 
 
 @dataclass(frozen=True)

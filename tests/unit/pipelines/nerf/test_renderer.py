@@ -7,13 +7,15 @@ import pytest
 import torch
 
 from pipelines.nerf import renderer as renderer_module
-from pipelines.nerf.cameras import Cameras, SceneTransform
-from pipelines.nerf.config import HashGridConfig
+from pipelines.nerf.engines.hash_encoders import HASH_ENCODERS
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.render_config import ALL_SAMPLES, RenderConfig
+from pipelines.nerf.networks.encodings import HashGrid
+from pipelines.nerf.options.methods.nerfacto import TensorGridConfig
+from pipelines.nerf.options.parts import HashGridConfig
+from pipelines.nerf.options.render import ALL_SAMPLES, RenderConfig
 from pipelines.nerf.renderer import RenderedImage, Renderer, pixels_in_blocks
-
-from .test_kernels import assert_close, random_model
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
+from tests.unit.pipelines.nerf.engines.cpu.parts.test_hash_grid import assert_close, random_model
 
 SCENE = SceneTransform(center=(1.0, 2.0, 3.0), scale=0.25)
 
@@ -115,6 +117,31 @@ def test_a_model_in_training_goes_on_training_and_is_read_anew() -> None:
     with torch.no_grad():
         model.field.color_mlp.layers[-1].bias += 1.0
     assert (renderer.render(two_cameras(), 0).rgb > before.rgb).mean() > 0.99
+
+
+@pytest.mark.parametrize("chosen", ["auto", "plain"])
+@pytest.mark.parametrize("before", ["plain", "fast"])
+def test_a_model_keeps_its_engine_whatever_it_is_rendered_with(before: str, chosen: str) -> None:
+    # Its field has no kernel, its grids have one.
+    model = random_model(position_encoding="vm", tensor_grid=TensorGridConfig(8, 2))
+    model.set_engine(before)
+    grids = [module for module in model.modules() if isinstance(module, HashGrid)]
+    used: list[str] = []
+
+    def engines() -> list[str]:
+        names = {encode: name for name, encode in HASH_ENCODERS.items()}
+        return [model.engine, *(names[grid.encode] for grid in grids)]
+
+    def note(share: float) -> None:
+        used.extend(engines())
+        raise InterruptedError
+
+    renderer = Renderer(model, SCENE, engine=chosen)
+    assert renderer.engine == "plain"
+    with pytest.raises(InterruptedError):
+        renderer.render(two_cameras(), 0, progress=note)
+    assert set(used) == {"fast" if chosen == "auto" else "plain"}
+    assert set(engines()) == {before}
 
 
 def test_what_progress_raises_ends_the_rendering() -> None:

@@ -10,17 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.nerf.cameras import Cameras, SceneTransform
-from pipelines.nerf.config import (
-    DataConfig,
-    HashGridConfig,
-    NerfactoConfig,
-    OptimizerConfig,
-    ProposalConfig,
-    TrainConfig,
-)
-from pipelines.nerf.data import ImageData
-from pipelines.nerf.rays import Rays
+from pipelines.nerf.data.images import ImageData
+from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, ProposalConfig
+from pipelines.nerf.options.parts import HashGridConfig
+from pipelines.nerf.options.train import DataConfig, OptimizerConfig, TrainConfig
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
+from pipelines.nerf.space.rays import Rays
 
 RADIUS = 0.5
 SIZE = 32

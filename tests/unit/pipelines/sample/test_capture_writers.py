@@ -13,8 +13,8 @@ import pytest
 from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
-from pipelines.cameras_file import CamerasFile
 from pipelines.sample.scene import pose_matrix, render
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.tools.ffmpeg import ffmpeg_executable
 from tests.capture_writers import (
     write_hdr_hevc,

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.cameras_file import CamerasFile
 from pipelines.errors import ToolError
 from pipelines.sample.__main__ import main
 from pipelines.sample.film import (
@@ -22,6 +21,7 @@ from pipelines.sample.film import (
     walk,
 )
 from pipelines.sample.scene import Floats, pose_matrix, raycast, render
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.tools.ffmpeg import ffmpeg_executable
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.cameras_file import CamerasFile
-from pipelines.orientation import Similarity
 from pipelines.sample.film import phone_camera, walk
 from pipelines.sample.judge import judge_mesh, judge_poses
 from pipelines.sample.scene import SUBJECT, THINGS, Floats, depth_image, pixel_rays, pose_matrix
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.orientation import Similarity
 
 TRUTH = walk(12, phone_camera(240))
 IDENTITY = Similarity(np.eye(3), np.zeros(3), 1.0)

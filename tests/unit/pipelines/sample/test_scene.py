@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.cameras_file import Intrinsics
 from pipelines.sample import tracing
 from pipelines.sample.film import hand_held_pose, phone_camera, walk
 from pipelines.sample.scene import (
@@ -20,6 +19,7 @@ from pipelines.sample.scene import (
     seen_surface,
     surface_distance,
 )
+from pipelines.scene.cameras_file import Intrinsics
 
 
 def _rays(num: int, seed: int = 0) -> tuple[Floats, Floats]:

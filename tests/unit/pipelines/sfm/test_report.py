@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.cameras_file import Intrinsics
 from pipelines.errors import PosesError
 from pipelines.options import PosesOptions
+from pipelines.scene.cameras_file import Intrinsics
 from pipelines.sfm.report import (
     Attempt,
     Outcome,
@@ -18,6 +18,7 @@ from pipelines.sfm.report import (
     gaps,
     unregistered_images,
 )
+from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source
 from pipelines.tools.colmap_results import PairStatistics, SparseModel, best_model
 
@@ -48,7 +49,7 @@ def outcome(models: list[SparseModel], num: int = 20, **changed: dict[int, int])
     for index, value in changed.get("inliers", {}).items():
         inliers[index] = value
     statistics = PairStatistics(features, inliers, 100, 90, np.zeros((0, 3, 3)))
-    return Outcome((Attempt("sequential", False, False, tuple(models), 1.0),), statistics)
+    return Outcome((Attempt(RUNGS[0], "sequential", tuple(models), 1.0),), statistics)
 
 
 def test_the_largest_model_is_chosen_wherever_it_stands() -> None:
@@ -59,7 +60,7 @@ def test_the_largest_model_is_chosen_wherever_it_stands() -> None:
 
 def test_the_best_attempt_is_chosen_and_the_first_among_equals() -> None:
     attempts = tuple(
-        Attempt(name, False, False, (model(tuple(range(size))),), 1.0)
+        Attempt(RUNGS[0], name, (model(tuple(range(size))),), 1.0)
         for name, size in (("a", 3), ("b", 9), ("c", 9))
     )
     assert Outcome(attempts, outcome([]).statistics).chosen.matcher == "b"

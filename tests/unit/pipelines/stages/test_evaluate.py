@@ -17,9 +17,9 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from pipelines.errors import Cancelled
 from pipelines.manifest import RunHooks
-from pipelines.nerf.checkpoint import load_model, save_model
-from pipelines.nerf.lpips import Lpips
-from pipelines.nerf.metrics import psnr, ssim
+from pipelines.nerf.judging.lpips import Lpips
+from pipelines.nerf.judging.metrics import psnr, ssim
+from pipelines.nerf.training.checkpoint import load_model, save_model
 from pipelines.stages.evaluate import (
     LPIPS_SHA256,
     LPIPS_WEIGHTS,

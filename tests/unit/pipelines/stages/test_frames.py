@@ -12,7 +12,8 @@ import pytest
 
 from pipelines.captures.video_frames import Frame
 from pipelines.errors import Cancelled, CaptureError
-from pipelines.options import FramesOptions, IngestOptions, StageOptions
+from pipelines.option_models import StageOptions
+from pipelines.options import FramesOptions, IngestOptions
 from pipelines.stage import StageContext
 from pipelines.stages import frames, ingest
 from pipelines.workspace import Workspace
@@ -23,6 +24,7 @@ from tests.unit.pipelines.tools.clips import (
     marked_pictures,
     number_in,
     rotated,
+    spherical,
 )
 
 
@@ -123,19 +125,48 @@ def test_frames_are_upright(tmp_path: Path, degrees: int, corner: tuple[int, int
     assert sorted(marks.values())[2] < 40
 
 
+def test_a_clip_turned_by_half_a_right_angle_keeps_its_times(tmp_path: Path) -> None:
+    """ffmpeg complains of such an angle in a message without an end of line."""
+    clip = make_clip(tmp_path / "a.mp4")
+    ingested(tmp_path, rotated(clip, tmp_path / "r.mp4", 45))
+    _, rows, _ = chosen(tmp_path, num_frames=20)
+    assert len(rows) == 20
+    indices = np.array([row["source_frame_index"] for row in rows])
+    np.testing.assert_allclose([row["timestamp_s"] for row in rows], indices / 30, atol=1e-4)
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+def test_avi_that_names_no_times_has_those_of_its_order(tmp_path: Path, codec: str) -> None:
+    """With frames stored out of order AVI says only how many there are in a second."""
+    clip = make_clip(tmp_path / "a.avi", "testsrc2=s=320x180:r=30:d=2", "-c:v", codec, "-bf", "2")
+    summary = ingested(tmp_path, clip)
+    assert summary["duration_s"] == pytest.approx(2.0, abs=1e-3)
+    assert summary["start_s"] == 0.0
+    _, rows, _ = chosen(tmp_path, num_frames=10)
+    times = np.array([row["timestamp_s"] for row in rows])
+    assert len(rows) == 10
+    np.testing.assert_allclose(np.diff(times), 0.2, atol=0.2)
+    assert (np.diff(times) > 0).all()
+
+
 @pytest.mark.parametrize("kind", ["hlg", "pq"])
-@pytest.mark.parametrize("only_transfer", [False, True])
-def test_hdr_colours_come_back_as_they_were_graded(
-    tmp_path: Path, kind: str, only_transfer: bool
+def test_hdr_clips_are_upright_and_need_only_their_transfer_named(
+    tmp_path: Path, kind: str
 ) -> None:
-    clip = make_hdr_clip(tmp_path / "a.mov", kind, only_transfer=only_transfer)
-    clip = rotated(clip, tmp_path / "r.mov", 90)
-    assert ingested(tmp_path, clip)["hdr"] == kind
-    summary, rows, out = chosen(tmp_path)
-    assert (summary["tone_mapped"], summary["width"], summary["height"]) == (True, 180, 320)
-    with PIL.Image.open(out / rows[0]["file"]) as image:
-        color = np.asarray(image)[160, 90].astype(int)
-    assert np.abs(color - [0x30, 0x60, 0xC0]).max() < 12, color
+    """Blue of (48, 96, 192) is darker, since what is brighter than white has its room above."""
+    colors = []
+    for only_transfer in (False, True):
+        folder = tmp_path / str(only_transfer)
+        folder.mkdir()
+        clip = make_hdr_clip(folder / "a.mov", kind, only_transfer=only_transfer)
+        clip = rotated(clip, folder / "r.mov", 90)
+        assert ingested(folder, clip)["hdr"] == kind
+        summary, rows, out = chosen(folder)
+        assert (summary["tone_mapped"], summary["width"], summary["height"]) == (True, 180, 320)
+        with PIL.Image.open(out / rows[0]["file"]) as image:
+            colors.append(np.asarray(image)[160, 90].astype(int))
+    assert np.abs(colors[0] - colors[1]).max() <= 1, colors
+    assert (np.abs(colors[0] - [48, 96, 192]) < [16, 8, 32]).all(), colors
 
 
 def test_sdr_colours_are_kept(tmp_path: Path) -> None:
@@ -151,6 +182,45 @@ def test_sdr_colours_are_kept(tmp_path: Path) -> None:
     with PIL.Image.open(out / rows[0]["file"]) as image:
         color = np.asarray(image)[90, 160].astype(int)
     assert np.abs(color - [0x30, 0x60, 0xC0]).max() < 5, color
+
+
+@pytest.mark.parametrize(
+    ("size", "matrix"), [("1280x720", "bt709"), ("720x1280", "bt709"), ("640x480", "bt601")]
+)
+def test_clips_that_name_no_matrix_have_that_of_their_size(
+    tmp_path: Path, size: str, matrix: str
+) -> None:
+    """BT.709 for HD, BT.601 below, as players do; the wrong one turns 255 of red into 233."""
+    clip = tmp_path / "a.mp4"
+    ffmpeg(
+        "-f", "lavfi", "-i", f"color=c=red:s={size}:r=30:d=0.4,format=gbrp",
+        "-vf", f"scale=out_color_matrix={matrix}:out_range=limited,format=yuv420p,"
+        "setparams=colorspace=unknown:color_primaries=unknown:color_trc=unknown", clip,
+    )  # fmt: skip
+    ingested(tmp_path, clip)
+    record = json.loads((tmp_path / "job" / "ingest" / "capture.json").read_text())
+    assert not {"bt709", "smpte170m"} & set(record["video"]["color"].split(", "))
+    _, rows, out = chosen(tmp_path)
+    with PIL.Image.open(out / rows[0]["file"]) as image:
+        color = np.asarray(image)[90, 160].astype(int)
+    assert np.abs(color - [255, 0, 0]).max() < 5, color
+
+
+def test_a_video_that_says_it_is_spherical_is_refused(tmp_path: Path) -> None:
+    clip = make_clip(tmp_path / "a.mp4", "testsrc2=s=640x320:r=30:d=0.5")
+    with pytest.raises(CaptureError, match="360-degree") as caught:
+        ingested(tmp_path, spherical(clip))
+    assert caught.value.code == "projection_unsupported"
+    assert "flat" in caught.value.hint
+
+
+@pytest.mark.parametrize(("size", "warned"), [("2048x1024", True), ("1920x1080", False)])
+def test_a_video_twice_as_wide_as_high_is_warned_of(
+    tmp_path: Path, size: str, warned: bool
+) -> None:
+    clip = make_clip(tmp_path / "a.mp4", f"color=c=gray:s={size}:r=30:d=0.4")
+    summary = ingested(tmp_path, clip)
+    assert any("360-degree" in warning for warning in summary["warnings"]) is warned
 
 
 def test_odd_sizes_are_written_whole(tmp_path: Path) -> None:

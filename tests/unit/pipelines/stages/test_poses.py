@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.cameras_file import CamerasFile
 from pipelines.errors import Cancelled, PosesError
+from pipelines.exports.formats.ply import read_ply
 from pipelines.options import PosesOptions
-from pipelines.ply import read_ply
 from pipelines.sample.align import similarity
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.sfm.rungs import RUNGS
 from pipelines.stage import StageContext
 from pipelines.stages.poses import run
 from pipelines.tools.colmap_results import read_statistics
@@ -27,7 +28,7 @@ from tests.unit.pipelines.sfm.synthetic_room import (
     turning_poses,
 )
 
-OPTIONS = PosesOptions(num_features=1500, max_image_px=400, camera_model="SIMPLE_RADIAL")
+OPTIONS = PosesOptions(num_features=1500, max_image_px=400)
 
 
 def context(root: Path, **more: Any) -> StageContext:
@@ -35,6 +36,14 @@ def context(root: Path, **more: Any) -> StageContext:
     out.mkdir(parents=True, exist_ok=True)
     workspace = Workspace(root)
     return StageContext("poses", workspace, out, workspace.checkpoint("poses"), **more)
+
+
+def failed_report(root: Path) -> dict[str, Any]:
+    """What a stage that raised left behind, and that it left nothing else."""
+    (left,) = (root / ".partial/poses").iterdir()
+    assert left.name == "report.json"
+    report: dict[str, Any] = json.loads(left.read_text("utf-8"))
+    return report
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +90,8 @@ def test_the_world_is_upright_and_cameras_fill_the_unit_cube(job: tuple[Path, An
 def test_the_lens_and_the_times_are_those_of_the_film(job: tuple[Path, Any, Any]) -> None:
     cameras = CamerasFile.load(job[0] / ".partial/poses/cameras.json")
     (lens,) = cameras.cameras
-    assert lens.fl_x == pytest.approx(FOCAL, rel=0.03)
+    assert lens.fl_x == lens.fl_y == pytest.approx(FOCAL, rel=0.01)
+    assert (lens.k2, lens.p1, lens.p2) == (0.0, 0.0, 0.0)
     assert [image.file for image in cameras.images][:3] == [
         "images/frame_00001.jpg",
         "images/frame_00002.jpg",
@@ -109,6 +119,13 @@ def test_the_report_says_which_frame_is_missing_and_why(job: tuple[Path, Any, An
     assert (report["num_images"], report["num_registered"]) == (12, 11)
     assert report["registered_ratio"] == pytest.approx(11 / 12)
     assert report["mean_reprojection_error_px"] < 1.0
+    assert report["metric"] is False
+    found = report["intrinsics"]
+    assert (found["model"], found["num_images"]) == ("SIMPLE_RADIAL", 11)
+    assert found["focal_px"] == pytest.approx(FOCAL, rel=0.01)
+    assert found["focal_spread_percent"] < 5.0
+    assert [one["model"] for one in found["candidates"]] == ["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
+    assert report["warnings"] == []
     (missing,) = report["unregistered"]
     assert missing["file"] == "images/frame_00003.jpg"
     assert missing["timestamp_s"] == 1.0
@@ -190,6 +207,10 @@ def test_flat_pictures_have_no_features(tmp_path: Path) -> None:
         run(OPTIONS, context(tmp_path))
     assert caught.value.code == "no_features"
     assert caught.value.message.startswith("0 of 10 images")
+    report = failed_report(tmp_path)
+    assert (report["error"]["code"], report["attempts"]) == ("no_features", [])
+    assert report["reasons"] == {"too_few_features": 10}
+    assert report["metric"] is False
 
 
 def test_unrelated_pictures_do_not_register(tmp_path: Path) -> None:
@@ -204,6 +225,13 @@ def test_unrelated_pictures_do_not_register(tmp_path: Path) -> None:
     assert caught.value.code == "too_few_registered"
     assert caught.value.message == "0 of 9 frames registered, at least 8 are needed."
     assert caught.value.details["reasons"] == {"too_few_matches": 9}
+    report = failed_report(tmp_path)
+    assert (report["num_images"], report["num_registered"], report["num_needed"]) == (9, 0, 8)
+    assert report["error"]["code"] == "too_few_registered"
+    assert [attempt["rung"] for attempt in report["attempts"]] == [rung.name for rung in RUNGS]
+    assert len(report["unregistered"]) == 9
+    assert report["reasons"] == {"too_few_matches": 9}
+    assert "more overlap" in report["advice"][-1]
 
 
 def test_turning_on_the_spot_is_told_from_bad_matching(tmp_path: Path) -> None:
@@ -212,6 +240,7 @@ def test_turning_on_the_spot_is_told_from_bad_matching(tmp_path: Path) -> None:
         run(OPTIONS, context(tmp_path))
     assert caught.value.code == "no_parallax"
     assert "Move sideways" in caught.value.hint
+    assert failed_report(tmp_path)["matching"]["num_one_homography"] > 0
 
 
 def test_a_cancel_ends_the_running_call(tmp_path: Path) -> None:

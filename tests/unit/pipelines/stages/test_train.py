@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.cameras_file import CamerasFile
 from pipelines.errors import Cancelled, TrainingError
 from pipelines.manifest import RunHooks
-from pipelines.nerf.checkpoint import load_model
-from pipelines.trained_scene import TrainedScene
+from pipelines.nerf.training.checkpoint import load_model
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.trained_scene import TrainedScene
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 

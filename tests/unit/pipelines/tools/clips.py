@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 from pathlib import Path
 
@@ -27,6 +28,30 @@ def rotated(clip: Path, path: Path, degrees: int) -> Path:
     """The same clip with a display matrix that asks players to turn it clockwise."""
     ffmpeg("-display_rotation", str(-degrees), "-i", clip, "-c", "copy", path)
     return path
+
+
+def spherical(clip: Path) -> Path:
+    """The MP4 with Google's Spherical Video V1 metadata in its track; moov lies at the end."""
+    xml = (
+        b'<?xml version="1.0"?><rdf:SphericalVideo xmlns:rdf="http://www.w3.org/1999/02/22-rdf-'
+        b'syntax-ns#" xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">'
+        b"<GSpherical:Spherical>true</GSpherical:Spherical>"
+        b"<GSpherical:Stitched>true</GSpherical:Stitched>"
+        b"<GSpherical:StitchingSoftware>test</GSpherical:StitchingSoftware>"
+        b"<GSpherical:ProjectionType>equirectangular</GSpherical:ProjectionType>"
+        b"</rdf:SphericalVideo>"
+    )
+    body = bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + xml
+    box = struct.pack(">I", 8 + len(body)) + b"uuid" + body
+    data = bytearray(clip.read_bytes())
+    assert data.index(b"mdat") < data.index(b"moov"), "offsets into mdat must not move"
+    track = data.index(b"trak") - 4
+    end = track + struct.unpack_from(">I", data, track)[0]
+    for start in (track, data.index(b"moov") - 4):
+        struct.pack_into(">I", data, start, struct.unpack_from(">I", data, start)[0] + len(box))
+    data[end:end] = box
+    clip.write_bytes(data)
+    return clip
 
 
 def marked_pictures(folder: Path, count: int, blurred: set[int]) -> None:

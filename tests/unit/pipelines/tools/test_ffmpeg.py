@@ -82,6 +82,40 @@ def test_dolby_vision_without_a_base_layer_is_told() -> None:
 
 
 @pytest.mark.parametrize(
+    ("pixels", "size", "matrix"),
+    [
+        ("yuv420p(progressive)", "1920x1080", "bt709"),
+        ("yuv420p(tv, unknown/bt709/bt709, progressive)", "1280x720", "bt709"),
+        ("yuv420p", "1280x544", "bt709"),
+        ("yuv420p", "480x854", "smpte170m"),
+        ("yuv420p(tv, bt709, progressive)", "640x480", None),
+        ("yuv420p(tv, smpte170m)", "1920x1080", None),
+        ("yuvj420p(pc, bt470bg/unknown/unknown)", "1920x1080", None),
+        ("gbrp(pc, gbr/bt709/bt709)", "1920x1080", None),
+        ("bgr24", "1920x1080", None),
+    ],
+)
+def test_matrix_is_assumed_where_none_is_named(pixels: str, size: str, matrix: str | None) -> None:
+    lines = PHONE_6.replace("yuv420p(tv, progressive), 640x480", f"{pixels}, {size}").splitlines()
+    assert parse_probe("matroska", lines).matrix == matrix
+
+
+@pytest.mark.parametrize(
+    ("words", "projection"),
+    [
+        ("spherical: equirectangular (0.000000/0.000000/0.000000)", "equirectangular"),
+        ("Spherical Mapping: half equirectangular (0/0/0)", "half equirectangular"),
+        ("spherical: cubemap [pad 0] (0/0/0)", "cubemap"),
+        ("Spherical Mapping: rectilinear (0/0/0)", ""),
+        ("Stereo 3D: side by side", ""),
+    ],
+)
+def test_projection_is_read_in_the_words_of_all_releases(words: str, projection: str) -> None:
+    lines = PHONE_6.replace("displaymatrix: rotation of 180.00 degrees", words).splitlines()
+    assert parse_probe("matroska", lines).projection == projection
+
+
+@pytest.mark.parametrize(
     ("degrees", "size"), [(0, (320, 180)), (90, (180, 320)), (180, (320, 180))]
 )
 def test_probe_of_a_real_clip_gives_the_upright_size(

@@ -120,3 +120,34 @@ def test_leaving_the_context_ends_the_program() -> None:
         pid = running._process.pid
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+def test_a_wait_with_a_limit_ends_the_program_that_does_not_come_to_its_end() -> None:
+    begun = time.monotonic()
+    with (
+        Program(python("import time; time.sleep(60)"), stdin=True) as running,
+        pytest.raises(ToolError, match="longer than 1 s") as caught,
+    ):
+        running.wait(0.6)
+    assert caught.value.code == "tool_timeout"
+    assert time.monotonic() - begun < 10
+
+
+def test_killing_the_program_frees_the_thread_that_feeds_it() -> None:
+    failures: list[ToolError] = []
+
+    def feed(running: Program) -> None:
+        try:
+            running.write(bytes(50_000_000))
+        except ToolError as error:
+            failures.append(error)
+
+    with Program(python("import time; time.sleep(60)"), stdin=True) as running:
+        feeder = threading.Thread(target=feed, args=(running,))
+        feeder.start()
+        time.sleep(0.3)
+        assert feeder.is_alive()
+        running.kill()
+        feeder.join(10.0)
+        assert not feeder.is_alive()
+    assert "signal 9" in failures[0].message

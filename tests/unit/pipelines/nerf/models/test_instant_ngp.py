@@ -10,24 +10,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipelines.nerf.cameras import Cameras
-from pipelines.nerf.checkpoint import load_model, save_model
-from pipelines.nerf.config import (
-    HashGridConfig,
-    InstantNgpConfig,
-    TrainConfig,
-    default_train_config,
-    validate,
-)
-from pipelines.nerf.data import ImageData
+from pipelines.nerf.along_ray.intervals import weights_from_density
+from pipelines.nerf.along_ray.occupancy import march
+from pipelines.nerf.along_ray.packed import PackedSamples
+from pipelines.nerf.along_ray.rendering import composite
+from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.intervals import weights_from_density
 from pipelines.nerf.models.instant_ngp import InstantNgp, first_rays
-from pipelines.nerf.occupancy import march
-from pipelines.nerf.packed import PackedSamples
-from pipelines.nerf.rays import Rays
-from pipelines.nerf.rendering import composite
-from pipelines.nerf.training import train
+from pipelines.nerf.options.methods.instant_ngp import InstantNgpConfig
+from pipelines.nerf.options.parts import HashGridConfig
+from pipelines.nerf.options.train import TrainConfig, default_train_config, validate
+from pipelines.nerf.space.cameras import Cameras
+from pipelines.nerf.space.rays import Rays
+from pipelines.nerf.training.checkpoint import load_model, save_model
+from pipelines.nerf.training.loop import train
 from tests.unit.pipelines.nerf.models.toy_runs import (
     SCENE,
     held_out_psnr,

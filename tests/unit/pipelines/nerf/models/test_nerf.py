@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipelines.nerf.checkpoint import load_model, save_model
-from pipelines.nerf.config import NerfConfig, TrainConfig, default_train_config, validate
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.nerf import Nerf, NerfField
-from pipelines.nerf.training import train
+from pipelines.nerf.options.methods.nerf import NerfConfig
+from pipelines.nerf.options.train import TrainConfig, default_train_config, validate
+from pipelines.nerf.training.checkpoint import load_model, save_model
+from pipelines.nerf.training.loop import train
 from tests.unit.pipelines.nerf.models.toy_runs import (
     SCENE,
     held_out_psnr,

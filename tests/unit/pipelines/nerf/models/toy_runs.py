@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import torch
 
-from pipelines.nerf.cameras import Cameras, SceneTransform
-from pipelines.nerf.config import DataConfig, ModelConfig, OptimizerConfig, TrainConfig
-from pipelines.nerf.data import ImageData
-from pipelines.nerf.metrics import psnr
+from pipelines.nerf.data.images import ImageData
+from pipelines.nerf.judging.metrics import psnr
 from pipelines.nerf.models.base import Model
+from pipelines.nerf.options.parts import ModelConfig
+from pipelines.nerf.options.train import DataConfig, OptimizerConfig, TrainConfig
 from pipelines.nerf.renderer import Renderer
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from tests.unit.pipelines.nerf.toy_scene import SIZE, toy_cameras, toy_images
 
 SCENE = SceneTransform((0.0, 0.0, 0.0), 1.0)

@@ -1,0 +1,110 @@
+"""What a photo's EXIF says of its lens: kept as data, while the picture itself loses all metadata.
+
+Kept, in `capture.json`: what tells lenses apart and gives their focal length (make, model, lens,
+focal lengths, width of the sensor), how the stored pixels were turned, and when the photo was taken
+by the camera's clock. Poses need the first for one camera model a lens and a focal length to start
+from. Everything else is dropped, above all what says where a photo was taken or by whose device:
+GPS, serial numbers, owner, thumbnails, the maker's notes. Numbers that no lens has are left out.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import PIL.Image
+
+# Tags of the Exif 2.32 standard.
+_MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
+_TAKEN_AT, _FOCAL_MM, _FOCAL_35MM, _LENS = 0x9003, 0x920A, 0xA405, 0xA434
+_PIXELS_X, _PIXELS_Y = 0xA002, 0xA003
+_PLANE_X, _PLANE_Y, _PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_MOST_LETTERS = 64
+_MALFORMED = (SyntaxError, ValueError, TypeError, KeyError, struct.error, OSError, EOFError)
+
+
+@dataclass(frozen=True)
+class Exif:
+    """What is kept of one photo's EXIF; None where it says nothing usable.
+
+    focal_mm: of the lens. focal_35mm: that of a 36 x 24 mm camera with the same angle of view
+    along the diagonal. sensor_mm: long side of the sensor that the picture covers.
+    orientation: 1 to 8, of the pixels as sent. taken_at: "YYYY:MM:DD HH:MM:SS", the camera's clock.
+    """
+
+    make: str | None = None
+    model: str | None = None
+    lens: str | None = None
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    sensor_mm: float | None = None
+    orientation: int | None = None
+    taken_at: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """What is known, as plain JSON."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
+
+
+def read_exif(image: PIL.Image.Image) -> Exif:
+    """What is kept of an opened picture's EXIF; nothing where there is none or it is malformed."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of tags that Pillow skips
+            tags = image.getexif()
+            detail = tags.get_ifd(_EXIF_IFD)
+        orientation = tags.get(_ORIENTATION)
+        return Exif(
+            make=_text(tags.get(_MAKE)),
+            model=_text(tags.get(_MODEL)),
+            lens=_text(detail.get(_LENS)),
+            focal_mm=_length(detail.get(_FOCAL_MM)),
+            focal_35mm=_length(detail.get(_FOCAL_35MM)),
+            sensor_mm=_sensor(detail),
+            orientation=orientation if orientation in range(1, 9) else None,
+            taken_at=_text(detail.get(_TAKEN_AT)),
+        )
+    except _MALFORMED:
+        return Exif()
+
+
+def _text(value: Any) -> str | None:
+    """A short printable text, or None."""
+    if not isinstance(value, str):
+        return None
+    kept = "".join(letter for letter in value if letter.isprintable()).strip()
+    return kept[:_MOST_LETTERS] or None
+
+
+def _number(value: Any) -> float | None:
+    """A finite number above 0, or None: 0 and 0/0 mean "not known"."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return round(number, 4) if math.isfinite(number) and number > 0 else None
+
+
+def _length(value: Any) -> float | None:
+    """A focal length in millimetres that a lens can have, or None."""
+    length = _number(value)
+    return length if length is not None and 0.5 <= length <= 5000 else None
+
+
+def _sensor(detail: Any) -> float | None:
+    """Long side of the sensor in millimetres, from its pixels and their density; or None."""
+    unit = _UNIT_MM.get(detail.get(_PLANE_UNIT, 2))
+    sides = [
+        pixels / density * unit
+        for pixels, density in (
+            (_number(detail.get(_PIXELS_X)), _number(detail.get(_PLANE_X))),
+            (_number(detail.get(_PIXELS_Y)), _number(detail.get(_PLANE_Y))),
+        )
+        if pixels is not None and density is not None and unit is not None
+    ]
+    longest = max(sides, default=0.0)
+    return round(longest, 4) if 1.0 <= longest <= 200.0 else None

@@ -1,0 +1,103 @@
+"""nerfstudio's layout: `transforms.json` and the pictures that it names.
+
+Keys: `pipelines.captures.transforms_json`; at the top also applied_transform, applied_scale.
+
+The file's world is kept as it is and taken as +Z up: that is nerfstudio's own convention, and what
+`applied_transform` has led to; both it and `applied_scale` are written down in the notes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pipelines.captures.contents import PosedPictures
+from pipelines.captures.importer import Claim, Importer, Listing
+from pipelines.captures.named_files import NamedFiles
+from pipelines.captures.parsing import malformed, number, numbers
+from pipelines.captures.transforms_json import Values, read_frames, read_transforms
+from pipelines.captures.unpack import CaptureArchive
+
+_FILE = "transforms.json"
+_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+
+
+def claims(listing: Listing) -> Claim | None:
+    """An archive with pictures and a `transforms.json`, the least deep one."""
+    roots = listing.roots_of(_FILE) if listing.pictures else []
+    return Claim(roots[0], _FILE) if roots else None
+
+
+def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
+    """The pictures that are listed and there.
+
+    Raises CaptureError: poses_missing, poses_malformed.
+    """
+    top, frames = read_transforms(archive, claim.root + _FILE)
+    listed = read_frames(archive, claim.root, _FILE, [(top, frame) for frame in frames])
+    unlisted = archive.images - listed.named
+    unread = _unread(archive, claim.root, top, frames)
+    archive.set_aside(unlisted, f"not listed in {_FILE}")
+    return PosedPictures(
+        sources=listed.sources,
+        failures=listed.failures,
+        metric=False,
+        notes=_notes(top),
+        details={
+            "num_listed": len(frames),
+            "num_missing": listed.num_missing,
+            "num_unlisted": len(unlisted),
+        },
+        warnings=[*listed.warnings, *unread],
+    )
+
+
+def _unread(archive: CaptureArchive, root: str, top: Values, frames: Sequence[Any]) -> list[str]:
+    """What the file says and nobody heeds: warnings; files that it names are set aside."""
+    files = NamedFiles(archive.names, root)
+    depths = [
+        str(frame["depth_file_path"])
+        for frame in frames
+        if isinstance(frame, dict) and frame.get("depth_file_path")
+    ]
+    exact, loose = files.find(depths)
+    archive.set_aside((exact | loose).values(), "depth is not read")
+    if isinstance(cloud := top.get("ply_file_path"), str):
+        exact, loose = files.find([cloud])
+        archive.set_aside((exact | loose).values(), "point clouds are not read")
+    warnings = []
+    if depths:
+        warnings.append(f"{_FILE} names {len(depths)} depth maps; depth is not used.")
+    if cloud:
+        warnings.append(f"{_FILE} names a point cloud; it is not used.")
+    if any(key in top for key in _SPLITS):
+        warnings.append(
+            f"{_FILE} says which pictures to hold out; training chooses them by its own rule."
+        )
+    if "orientation_override" in top:
+        warnings.append(f"{_FILE} has orientation_override; its world is taken as it is, +Z up.")
+    return warnings
+
+
+def _notes(top: Values) -> dict[str, Any]:
+    """What the file says of its world, for who wants to go back to the original one."""
+    notes: dict[str, Any] = {"world": "as in transforms.json, taken as +Z up"}
+    applied = top.get("applied_transform")
+    if applied is not None:
+        rows = applied if isinstance(applied, list) and len(applied) in (3, 4) else None
+        if rows is None:
+            raise malformed("applied_transform of transforms.json is not a 3x4 matrix.")
+        notes["applied_transform"] = [
+            numbers(row, 4, "A row of applied_transform") for row in rows[:3]
+        ]
+    if "applied_scale" in top:
+        notes["applied_scale"] = number(top["applied_scale"], "applied_scale")
+    return notes
+
+
+IMPORTER = Importer(
+    kind="nerfstudio",
+    brings="poses",
+    claims=claims,
+    read="pipelines.captures.importers.nerfstudio:read",
+)

@@ -1,0 +1,217 @@
+"""A video: is it whole, can it be decoded, how long and how large is it.
+
+Nothing is copied or converted here; `pipelines.stages.frames` reads the upload itself.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pipelines.captures.minimum import MIN_IMAGES
+from pipelines.captures.record import Found
+from pipelines.errors import CaptureError, ToolError
+from pipelines.options import IngestOptions
+from pipelines.stage import StageContext
+from pipelines.tools.ffmpeg import VideoInfo, probe, run_ffmpeg, untrusted_input
+
+_SCAN_LIMIT_S = 900.0
+_DECODE_LIMIT_S = 120.0
+_FRAMES_TRIED = 3
+_PANORAMA_PX = 1920
+"""Equirectangular video is twice as wide as high, and no camera's is narrower."""
+_NOT_SET = -(2**63)
+_CUT_OFF = ("partial file", "ended prematurely", "moov atom not found")
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What the packets of a video say, without decoding.
+
+    times_s: when each frame is shown, increasing, seconds from the start of the file.
+    duration_s: end of the last frame. is_cut_off: whether the file ends too early.
+    """
+
+    times_s: tuple[float, ...]
+    duration_s: float
+    is_cut_off: bool
+
+
+def scan(path: Path, ctx: StageContext) -> Scan:
+    """Walk through all packets of the video stream. Raises ToolError where that fails."""
+    times: list[int] = []
+    ends: list[int] = []
+    unit: list[float] = []
+    log: list[str] = []
+    pending = bytearray()
+
+    def on_stdout(chunk: bytes) -> None:
+        pending.extend(chunk)
+        *lines, rest = bytes(pending).split(b"\n")
+        pending[:] = rest
+        for line in lines:
+            if line.startswith(b"#tb 0:"):
+                above, below = line.split(b":", 1)[1].split(b"/")
+                unit.append(int(above) / int(below))
+            elif line and not line.startswith(b"#"):
+                _, dts, pts, duration, *_ = line.split(b",")
+                times.append(_ticks(pts, dts, default=max(ends, default=0)))
+                ends.append(times[-1] + int(duration))
+
+    stream = untrusted_input(path).output(
+        "pipe:1", map="0:V:0", c="copy", f="framecrc", **{"an": None, "sn": None, "dn": None}
+    )
+    run_ffmpeg(
+        stream,
+        log_level="warning",
+        time_limit_s=_SCAN_LIMIT_S,
+        is_cancelled=ctx.is_cancelled,
+        on_line=log.append,
+        on_stdout=on_stdout,
+    )
+    seconds = unit[0] if unit else 0.0
+    return Scan(
+        times_s=tuple(sorted(value * seconds for value in times)),
+        duration_s=max(ends, default=0) * seconds,
+        is_cut_off=any(sign in line for line in log for sign in _CUT_OFF),
+    )
+
+
+def _ticks(*stamps: bytes, default: int) -> int:
+    """The first time stamp that is set; AVI has none for when frames are shown, only their order.
+
+    ffmpeg writes one that is not set as the smallest integer, or as NOPTS.
+    """
+    for stamp in stamps:
+        if b"NOPTS" not in stamp and int(stamp) > _NOT_SET:
+            return int(stamp)
+    return default
+
+
+def read(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
+    """Check the video at `path`.
+
+    Raises CaptureError: video_truncated, no_video_stream, video_undecodable, video_too_long,
+    too_large, too_few_images, projection_unsupported.
+    """
+    ctx.progress(0.0, "Reading the video's index")
+    info = probe(path)
+    _check_size(info, options)
+    _check_projection(info)
+    ctx.progress(0.1, "Looking for the end of the video")
+    try:
+        packets = scan(path, ctx)
+    except ToolError as error:
+        if error.code == "tool_timeout":
+            raise
+        raise _undecodable(error) from error
+    if packets.is_cut_off:
+        raise CaptureError(
+            "The video is cut off: its index promises more than the file holds.",
+            code="video_truncated",
+            hint="Upload the file again; it was not copied or recorded to its end.",
+        )
+    ctx.progress(0.7, "Decoding the first frames")
+    _try_decoding(path, ctx)
+    num_frames = len(packets.times_s)
+    if num_frames < MIN_IMAGES:
+        raise CaptureError(
+            f"The video has {num_frames} frames; at least {MIN_IMAGES} are needed.",
+            code="too_few_images",
+            hint="Film for 10 seconds or more, moving around the subject.",
+        )
+    duration_s = packets.duration_s
+    if duration_s > options.max_duration_s:
+        raise CaptureError(
+            f"The video is {duration_s:.0f} s long; {options.max_duration_s:.0f} s are allowed.",
+            code="video_too_long",
+            hint="Cut the video, or raise ingest.max_duration_s.",
+        )
+    fps = info.fps or (num_frames / duration_s if duration_s > 0 else None)
+    info = replace(info, num_frames=num_frames, duration_s=round(duration_s, 6), fps=fps)
+    return Found(video=info.as_dict(), details=_details(info, packets), warnings=_warnings(info))
+
+
+def _check_size(info: VideoInfo, options: IngestOptions) -> None:
+    if info.width * info.height > options.max_pixels:
+        raise CaptureError(
+            f"The video's frames are {info.width}x{info.height}; "
+            f"{options.max_pixels} pixels are allowed.",
+            code="too_large",
+            hint="Export the video at 4K or less.",
+        )
+
+
+def _check_projection(info: VideoInfo) -> None:
+    if info.projection:
+        raise CaptureError(
+            f"The video is a 360-degree one ({info.projection}); only plain views can be used.",
+            code="projection_unsupported",
+            hint="Export plain (flat, perspective) clips from the camera's app, or film with a "
+            "phone.",
+        )
+
+
+def _details(info: VideoInfo, packets: Scan) -> dict[str, object]:
+    gaps = [b - a for a, b in zip(packets.times_s, packets.times_s[1:], strict=False)]
+    middle = sorted(gaps)[len(gaps) // 2]
+    variable = middle > 0 and any(abs(gap - middle) > 0.3 * middle for gap in gaps)
+    return {
+        "width": info.width,
+        "height": info.height,
+        "fps": info.fps,
+        "duration_s": info.duration_s,
+        "codec": info.codec,
+        "rotation_deg": info.rotation_deg,
+        "hdr": info.hdr,
+        "variable_frame_rate": variable,
+        "start_s": round(packets.times_s[0], 6),
+    }
+
+
+def _warnings(info: VideoInfo) -> list[str]:
+    warnings = []
+    if max(info.width, info.height) < 480:
+        warnings.append(f"The video is small ({info.width}x{info.height}): details will be few.")
+    if info.width == 2 * info.height and info.width >= _PANORAMA_PX:
+        warnings.append(
+            "The video is twice as wide as high, as 360-degree videos are. If it is one, its poses "
+            "will be wrong: export plain (flat) clips from the camera's app."
+        )
+    if info.hdr == "dolby":
+        warnings.append("The video is Dolby Vision without a compatible layer: colours may be off.")
+    return warnings
+
+
+def _try_decoding(path: Path, ctx: StageContext) -> None:
+    """Decode the first frames. Raises CaptureError video_undecodable."""
+    seen: list[bytes] = []
+    stream = untrusted_input(path).output(
+        "pipe:1",
+        map="0:V:0",
+        f="framecrc",
+        **{"frames:v": _FRAMES_TRIED, "an": None, "sn": None, "dn": None},
+    )
+    try:
+        run_ffmpeg(
+            stream,
+            time_limit_s=_DECODE_LIMIT_S,
+            is_cancelled=ctx.is_cancelled,
+            on_stdout=seen.append,
+        )
+    except ToolError as error:
+        if error.code == "tool_timeout":
+            raise
+        raise _undecodable(error) from error
+    if not re.search(rb"^0,", b"".join(seen), re.MULTILINE):
+        raise _undecodable(None)
+
+
+def _undecodable(error: ToolError | None) -> CaptureError:
+    return CaptureError(
+        "The video's pictures cannot be decoded.",
+        code="video_undecodable",
+        hint="Check that it plays, or export it again as MP4 with H.264 or HEVC.",
+        details=error.details if error else None,
+    )

@@ -1,0 +1,297 @@
+"""Which pictures of an archive are photos: what else lies beside them is set aside, with a reason.
+
+Four things tell, in this order:
+
+1. channels: beside colour photos, a lossless picture of one channel is a mask, a depth or a
+   confidence map. Where no picture has colour, grey ones are photos unless their name says what
+   else they are.
+2. values: pictures of a few flat colours are masks or label maps. Only those that are packed far
+   smaller than photos are decoded for it.
+3. names: folders and files called mask, depth, conf, thumbnail and the like (`roles`), which speak
+   only where photos remain beside them.
+4. copies: the same picture again, in the same size or reduced (`images_2/`, `images_4/`); decided
+   by comparing what they show, not by the folder.
+
+What cannot be decoded stays, for whoever writes the pictures to report.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import PIL.Image
+
+from pipelines.captures.roles import file_role, folder_role, named_role, plain_stem
+from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
+from pipelines.stage import StageContext
+
+_HEADER_BYTES = 256 << 10
+_MOST_BYTES = 256 << 20
+_UNREADABLE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    struct.error,
+    PIL.Image.DecompressionBombError,
+)
+"""What Pillow raises for a damaged picture."""
+
+_FEW_COLORS = 32
+_FLAT_BYTES_PER_PIXEL = {"JPEG": 0.1, "PNG": 0.25, "WEBP": 0.1}
+"""Pictures of few flat colours are packed smaller; photos are only where they are very empty."""
+_HEADER_ALLOWANCE_BYTES = 2048
+_FLAT_LOOK_PX = 256
+_NEAR = 12
+"""How far, of 255, JPEG moves the values of a picture of black and white."""
+_BINARY_SHARE = 0.98
+"""Of the pixels; the others lie on the edges, which a reduced picture blurs."""
+
+_ASPECT_SLACK = 0.02
+_COMPARED_PX = 48
+_COPY_DIFFERENCE = 3.0
+"""Mean difference in brightness, of 255, of reduced pictures that show the same. On real photos a
+copy at an eighth of the size comes to 0.7 to 2.8, by its filter; a view a hundredth of the picture
+aside to 6 and more."""
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What a picture's header says."""
+
+    name: str
+    kind: str
+    mode: str
+    width: int
+    height: int
+
+    @property
+    def num_pixels(self) -> int:
+        return self.width * self.height
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether a value has more than 8 bits."""
+        return self.mode.startswith(("I", "F"))
+
+    @property
+    def has_color(self) -> bool:
+        return self.mode not in ("1", "L", "LA", "La") and not self.is_deep
+
+
+def choose_photos(
+    archive: CaptureArchive, names: Sequence[str], max_pixels: int, ctx: StageContext
+) -> list[str]:
+    """Those of the pictures that are photos. The others are set aside in the archive.
+
+    max_pixels: pictures with more are not decoded here. Raises CaptureError no_images where no
+    photo is left.
+    """
+    looks = []
+    unreadable = []
+    for done, name in enumerate(sorted(names), start=1):
+        look = _look(archive, name)
+        if look is None:
+            unreadable.append(name)
+        else:
+            looks.append(look)
+        ctx.progress(0.0, f"Looking at picture {done} of {len(names)}")
+    images = _Images(archive, max_pixels)
+    looks = _by_channels(archive, looks)
+    looks = _by_values(archive, looks, images)
+    looks = _by_names(archive, looks)
+    looks = _without_copies(archive, looks, images, ctx)
+    if names and not looks and not unreadable:
+        raise CaptureError(
+            f"The archive has {len(names)} pictures, and none of them is a photo.",
+            code="no_images",
+            hint="Send the photos; masks, depth and confidence maps are not needed.",
+        )
+    return [look.name for look in looks] + unreadable
+
+
+def _look(archive: CaptureArchive, name: str) -> _Look | None:
+    kind = archive.image_format(name)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            data = io.BytesIO(archive.peek(name, _HEADER_BYTES))
+            with PIL.Image.open(data, formats=[kind]) as image:
+                return _Look(name, kind, image.mode, image.width, image.height)
+    except _UNREADABLE:
+        return None
+
+
+class _Images:
+    """Decodes pictures of the archive to look at them, small where the format allows it."""
+
+    def __init__(self, archive: CaptureArchive, max_pixels: int) -> None:
+        self._archive = archive
+        self._max_pixels = max_pixels
+
+    def decoded(self, look: _Look, near_px: int) -> PIL.Image.Image | None:
+        """The picture in RGB, or None where it does not decode or has too many pixels.
+
+        near_px: a JPEG is decoded at the smallest size that is no smaller.
+        """
+        if look.num_pixels > self._max_pixels:
+            return None
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                data = io.BytesIO(self._archive.peek(look.name, _MOST_BYTES))
+                with PIL.Image.open(data, formats=[look.kind]) as image:
+                    image.draft("RGB", (near_px, near_px))
+                    return image.convert("RGB")
+        except _UNREADABLE:
+            return None
+
+
+def _by_channels(archive: CaptureArchive, looks: Sequence[_Look]) -> list[_Look]:
+    if any(look.has_color for look in looks):
+        # Cameras write grey photos too, as JPEG; maps, whose values count, are never lossy.
+        out = [look for look in looks if not look.has_color and look.kind != "JPEG"]
+    else:
+        out = [look for look in looks if named_role(look.name) is not None]
+    deep = [look.name for look in out if look.is_deep]
+    archive.set_aside(deep, "one channel of 16 bits or more, as depth maps have")
+    archive.set_aside(
+        [look.name for look in out if not look.is_deep],
+        "one channel, as masks and confidence maps have",
+    )
+    return _without(looks, [look.name for look in out])
+
+
+def _by_values(archive: CaptureArchive, looks: Sequence[_Look], images: _Images) -> list[_Look]:
+    out = [
+        look.name
+        for look in looks
+        if archive.num_bytes(look.name) - _HEADER_ALLOWANCE_BYTES
+        < _FLAT_BYTES_PER_PIXEL[look.kind] * look.num_pixels
+        and (image := images.decoded(look, near_px=_FLAT_LOOK_PX)) is not None
+        and _is_flat(image)
+    ]
+    archive.set_aside(out, "a few flat colours, as masks and label maps have")
+    return _without(looks, out)
+
+
+def _is_flat(image: PIL.Image.Image) -> bool:
+    """Whether a picture has a handful of colours, or black and white alone.
+
+    It takes both: an object may well lie small on a white table.
+    """
+    if image.getcolors(_FEW_COLORS) is not None:
+        return True
+    values = np.asarray(image)
+    black = (values <= _NEAR).all(axis=-1).mean()
+    white = (values >= 255 - _NEAR).all(axis=-1).mean()
+    return bool(min(black, white) > 1 - _BINARY_SHARE and black + white >= _BINARY_SHARE)
+
+
+def _by_names(archive: CaptureArchive, looks: Sequence[_Look]) -> list[_Look]:
+    in_folders = _folders_beside_photos(looks)
+    photos = {plain_stem(look.name) for look in looks if named_role(look.name) is None}
+    out = []
+    for look in looks:
+        folder, own = folder_role(look.name), file_role(look.name)
+        if folder in in_folders:
+            archive.set_aside([look.name], f"in a folder for {folder}")
+        elif own and _has_partner(look.name, photos):
+            archive.set_aside([look.name], f"named as {own}")
+        else:
+            continue
+        out.append(look.name)
+    return _without(looks, out)
+
+
+def _folders_beside_photos(looks: Sequence[_Look]) -> set[str]:
+    """What folders say that pictures are, as far as there are photos beside those.
+
+    Who films a mask may well call the folder so; half as many photos elsewhere are asked for.
+    """
+    by_role = Counter(folder_role(look.name) for look in looks)
+    return {role for role, count in by_role.items() if role and 2 * by_role[None] >= count}
+
+
+def _has_partner(name: str, photos: set[str]) -> bool:
+    """Whether a photo has the same name but for the word, or, of mere numbers, the same number."""
+    stem = plain_stem(name)
+    return stem in photos or (
+        stem.isdigit()
+        and any(photo.lstrip("abcdefghijklmnopqrstuvwxyz") == stem for photo in photos)
+    )
+
+
+def _without_copies(
+    archive: CaptureArchive, looks: Sequence[_Look], images: _Images, ctx: StageContext
+) -> list[_Look]:
+    """The pictures without those that show the same as another, of equal size or larger."""
+    by_bytes = _groups(
+        looks, lambda look: (archive.checksum(look.name), archive.num_bytes(look.name))
+    )
+    out = [look.name for group in by_bytes for look in group[1:]]
+    archive.set_aside(out, "the same picture again")
+    looks = _without(looks, out)
+    reduced = []
+    for group in _groups(looks, lambda look: plain_stem(look.name)):
+        ctx.check_cancelled()
+        reduced += _copies(group, images)
+    archive.set_aside(reduced, "a copy of a larger or equal picture")
+    return _without(looks, reduced)
+
+
+def _groups(looks: Iterable[_Look], key: Callable[[_Look], object]) -> list[list[_Look]]:
+    """Pictures of equal key, groups of one left out, the largest first in each."""
+    found: dict[object, list[_Look]] = defaultdict(list)
+    for look in looks:
+        found[key(look)].append(look)
+    return [
+        sorted(group, key=lambda look: (-look.num_pixels, look.name.count("/"), look.name))
+        for group in found.values()
+        if len(group) > 1
+    ]
+
+
+def _copies(group: Sequence[_Look], images: _Images) -> list[str]:
+    """Names of those that show the same as a larger or earlier one of the group."""
+    kept: list[tuple[_Look, PIL.Image.Image]] = []
+    copies = []
+    for look in group:
+        image = images.decoded(look, near_px=2 * _COMPARED_PX)
+        if image is None:
+            continue
+        if any(_shows_same(look, image, other, original) for other, original in kept):
+            copies.append(look.name)
+        else:
+            kept.append((look, image))
+    return copies
+
+
+def _shows_same(
+    look: _Look, image: PIL.Image.Image, other: _Look, original: PIL.Image.Image
+) -> bool:
+    """Whether a picture is one that is no smaller, by shape and by what both show, reduced."""
+    aspect = (look.width * other.height) / (look.height * other.width)
+    side = min(_COMPARED_PX, max(1, min(image.size) // 2))
+    reduced = [
+        np.asarray(item.convert("L").resize((side, side), PIL.Image.Resampling.BOX), np.float32)
+        for item in (image, original)
+    ]
+    difference = float(np.abs(reduced[0] - reduced[1]).mean())
+    return abs(aspect - 1) <= _ASPECT_SLACK and difference <= _COPY_DIFFERENCE
+
+
+def _without(looks: Iterable[_Look], names: Iterable[str]) -> list[_Look]:
+    out = set(names)
+    return [look for look in looks if look.name not in out]

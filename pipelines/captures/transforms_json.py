@@ -1,0 +1,259 @@
+"""The family of `transforms.json`: frames with `file_path` and `transform_matrix`, lenses in keys.
+
+Instant NGP, nerfstudio and the Blender scenes of NeRF write it, each with keys of its own. At the
+top or in a frame: fl_x fl_y cx cy w h, k1..k4 p1 p2 or distortion_params (k1 k2 k3 k4 p1 p2),
+camera_angle_x/y (radians) in place of focal lengths, camera_model, is_fisheye. In a frame:
+file_path, transform_matrix (world_from_camera, OpenGL camera), mask_path, timestamp or time.
+Standard library only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from pipelines.captures.archive_rules import shown
+from pipelines.captures.contents import PosedSource
+from pipelines.captures.named_files import NamedFiles
+from pipelines.captures.parsing import (
+    each_frame,
+    malformed,
+    missing,
+    number,
+    numbers,
+    pose_rows,
+    resized,
+    some_of,
+)
+from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
+from pipelines.scene.cameras_file import Intrinsics
+
+MODELS = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "OPENCV": "OPENCV",
+    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
+}
+"""Camera models that are read, and what they become."""
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+Values = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Listed:
+    """What the frames of a file come to.
+
+    named: all files that frames name, masks among them. num_missing: frames whose picture is not
+    in the archive.
+    """
+
+    sources: list[PosedSource]
+    failures: list[CaptureError]
+    warnings: list[str]
+    named: frozenset[str]
+    num_missing: int
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a listing. values: its own keys over those of the top."""
+
+    values: Values
+    own: Values
+    path: str
+
+    @property
+    def mask_path(self) -> str:
+        """Where its mask should be, or ""."""
+        path = self.own.get("mask_path")
+        return path if isinstance(path, str) else ""
+
+
+def read_transforms(archive: CaptureArchive, name: str) -> tuple[Values, list[Any]]:
+    """The keys at the top of a transforms file, and its frames, which may be none.
+
+    Raises CaptureError poses_malformed where it is no JSON.
+    """
+    transforms = archive.read_json(name)
+    frames = transforms.get("frames") if isinstance(transforms, dict) else None
+    if not isinstance(frames, list):
+        raise missing(f"{shown(name)} has no list of frames.")
+    return {key: value for key, value in transforms.items() if key != "frames"}, frames
+
+
+def read_frames(
+    archive: CaptureArchive, root: str, file: str, listed: Sequence[tuple[Values, Any]]
+) -> Listed:
+    """The pictures that frames name, and their poses.
+
+    root: folder that paths are relative to. file: what messages call the listing. listed: keys of
+    the top, and a frame, for each frame.
+    Raises CaptureError: poses_missing where no picture is in the archive.
+    """
+    if not listed:
+        raise missing(f"{file} lists no frames.")
+    frames, failures = _checked(file, listed)
+    files = NamedFiles(archive.images, root)
+    exact, loose = files.find(frame.path for frame in frames)
+    mask_exact, mask_loose = files.find(frame.mask_path for frame in frames if frame.mask_path)
+    found, masks = exact | loose, mask_exact | mask_loose
+    there: dict[str, Frame] = {}
+    for frame in frames:
+        if frame.path in found:
+            there.setdefault(found[frame.path], frame)
+    if not there:
+        raise (failures or [_none_there(file, len(listed))])[0]
+    sources, unusable = each_frame(
+        archive,
+        there,
+        lambda name, frame: _source(file, name, frame, masks.get(frame.mask_path)),
+    )
+    absent = [frame.path for frame in frames if frame.path not in found]
+    warnings = _warnings(file, frames, absent, loose | mask_loose)
+    lost = [
+        frame.mask_path
+        for frame in there.values()
+        if frame.mask_path and frame.mask_path not in masks
+    ]
+    if lost:
+        warnings.append(
+            f"{len(lost)} masks that {file} names are not in the archive, and their pictures "
+            f"are used whole: {some_of(lost)}."
+        )
+    return Listed(
+        sources=sources,
+        failures=failures + unusable,
+        warnings=warnings,
+        named=frozenset([*found.values(), *masks.values()]),
+        num_missing=len(absent),
+    )
+
+
+def _checked(
+    file: str, listed: Sequence[tuple[Values, Any]]
+) -> tuple[list[Frame], list[CaptureError]]:
+    """The frames that name a picture, and the errors of the others."""
+    frames = []
+    failures = []
+    for index, (top, own) in enumerate(listed):
+        path = own.get("file_path") if isinstance(own, dict) else None
+        if isinstance(path, str) and path:
+            frames.append(Frame({**top, **own}, own, path))
+        else:
+            failures.append(malformed(f"Frame {index} of {file} has no file_path."))
+    return frames, failures
+
+
+def _none_there(file: str, count: int) -> CaptureError:
+    return missing(f"{file} lists {count} pictures, and none of them is in the archive.")
+
+
+def _warnings(
+    file: str, frames: Sequence[Frame], absent: Sequence[str], loose: Mapping[str, str]
+) -> list[str]:
+    warnings = []
+    if absent:
+        warnings.append(
+            f"{file} lists {len(frames)} pictures; {len(absent)} of them are not in the "
+            f"archive: {some_of(absent)}."
+        )
+    if loose:
+        path, name = min(loose.items())
+        warnings.append(
+            f"{len(loose)} paths in {file} lead nowhere in the archive and were matched by the end "
+            f'of the name, as "{shown(path)}" with "{shown(name)}".'
+        )
+    twice = [path for path, count in Counter(frame.path for frame in frames).items() if count > 1]
+    if twice:
+        warnings.append(
+            f"{file} lists {len(twice)} pictures more than once, and the first pose is taken: "
+            f"{some_of(twice)}."
+        )
+    return warnings
+
+
+def _source(file: str, name: str, frame: Frame, mask: str | None) -> PosedSource:
+    what = f'"{shown(name)}"'
+    rows = frame.own.get("transform_matrix")
+    if rows is None:
+        raise missing(f"{what} has no transform_matrix in {file}.")
+    time = next((frame.own[key] for key in ("timestamp", "time") if key in frame.own), None)
+    return PosedSource(
+        name=name,
+        lens=partial(_lens, frame.values, what),
+        world_from_camera=pose_rows(rows, f"the pose of {what}"),
+        timestamp_s=None if time is None else number(time, f"The time of {what}"),
+        mask=mask,
+    )
+
+
+def _model(values: Values, distortion: Mapping[str, float], what: str) -> str:
+    name = values.get("camera_model")
+    if name is None:
+        if values.get("is_fisheye"):
+            return "OPENCV_FISHEYE"
+        return "OPENCV" if any(distortion.values()) else "PINHOLE"
+    if not isinstance(name, str) or name not in MODELS:
+        raise malformed(
+            f'The camera model of {what} is "{shown(str(name))}"; '
+            f"{', '.join(MODELS)} are supported."
+        )
+    return MODELS[name]
+
+
+def _distortion(values: Values, what: str) -> dict[str, float]:
+    if "distortion_params" in values:
+        listed = numbers(values["distortion_params"], 6, f"distortion_params of {what}")
+        return dict(zip(_DISTORTION, listed, strict=True))
+    return {key: number(values.get(key, 0.0), f"{key} of {what}") for key in _DISTORTION}
+
+
+def _lens(values: Values, what: str, width: int, height: int) -> Intrinsics:
+    """The intrinsics for a picture that really is `width` x `height`.
+
+    Raises CaptureError: poses_missing without a focal length, poses_malformed.
+    """
+    stated_w = round(number(values.get("w", width), f"w of {what}"))
+    stated_h = round(number(values.get("h", height), f"h of {what}"))
+    distortion = _distortion(values, what)
+    model = _model(values, distortion, what)
+    if model == "PINHOLE":
+        distortion = dict.fromkeys(_DISTORTION, 0.0)
+    elif model == "OPENCV_FISHEYE":
+        distortion = {**distortion, "p1": 0.0, "p2": 0.0}
+    focal_x = _focal(values, "x", stated_w, what)
+    focal_y = _focal(values, "y", stated_h, what)
+    if focal_x is None and focal_y is None:
+        raise missing(f"There is no focal length for {what}.")
+    lens = Intrinsics(
+        width=stated_w,
+        height=stated_h,
+        fl_x=focal_x or focal_y or 0.0,
+        fl_y=focal_y or focal_x or 0.0,
+        cx=number(values.get("cx", stated_w / 2), f"cx of {what}"),
+        cy=number(values.get("cy", stated_h / 2), f"cy of {what}"),
+        model=model,
+        **distortion,
+    )
+    return resized(lens, width, height)
+
+
+def _focal(values: Values, axis: str, size: int, what: str) -> float | None:
+    """The focal length along an axis in pixels, from fl_ or the field of view; else None."""
+    if f"fl_{axis}" in values:
+        return number(values[f"fl_{axis}"], f"fl_{axis} of {what}")
+    if f"camera_angle_{axis}" in values:
+        angle = number(values[f"camera_angle_{axis}"], f"camera_angle_{axis} of {what}")
+        if not 0 < angle < math.pi:
+            raise malformed(f"camera_angle_{axis} of {what} is no field of view.")
+        return 0.5 * size / math.tan(0.5 * angle)
+    return None

@@ -1,0 +1,115 @@
+"""The mesh: rendered depth fused into coloured triangles, as PLY and GLB.
+
+`mesh.ply` is in the world frame of cameras.json, `mesh.glb` has +Y up, as glTF demands.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipelines.errors import ExportError
+from pipelines.exports.export import Export
+from pipelines.exports.options import CropOptions, reach_of
+from pipelines.stage import Artifact, StageContext
+
+if TYPE_CHECKING:
+    from pipelines.scene.trained_scene import TrainedScene
+
+_RENDER_SHARE, _FUSE_SHARE = 0.7, 0.97
+
+
+class MeshOptions(CropOptions):
+    """The mesh, by fusing rendered depth (TSDF)."""
+
+    resolution: int = Field(
+        256, ge=32, le=2048, description="Voxels along the longest side of the subject."
+    )
+    num_views: int = Field(
+        0, ge=0, le=5000, description="Training views fused, evenly picked; 0 for all."
+    )
+    render_long_side_px: int = Field(
+        640, ge=64, le=4096, description="Long side of the rendered depth, in pixels."
+    )
+    max_faces: int = Field(
+        200_000,
+        ge=100,
+        le=20_000_000,
+        description="The subject is simplified to this, what lies beyond to a quarter of it a "
+        "shell.",
+    )
+
+
+def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[str, Any]:
+    """Make the mesh. Raises ExportError `empty_mesh` where the model shows no surface."""
+    # Imported where it runs: the API reads this file too.
+    from pipelines.exports.formats import glb, ply
+    from pipelines.exports.surface.shells import find_shells, fuse_shells
+    from pipelines.exports.surface.views import known_depths, render_views
+    from pipelines.scene.depth_views import Pinhole
+
+    ctx.progress(0.0, "looking for the scene's bounds")
+    probes = scene.probe_views(ctx.check_cancelled)
+    shells = find_shells(
+        lambda distance: scene.bounds(distance, ctx.check_cancelled, probes),
+        options.max_distance,
+        reach_of(options),
+        options.resolution,
+    )
+    if not shells:
+        raise _empty("no ray of the training views met a surface")
+    images = scene.training_images(options.num_views)
+    known = known_depths(ctx.workspace, options.use_depth_maps)
+    with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
+        lenses = [Pinhole.of(scene.lens_of(image), options.render_long_side_px) for image in images]
+        store = render_views(scene, images, lenses, Path(folder), ctx, _RENDER_SHARE, known)
+        mesh = fuse_shells(
+            store,
+            shells,
+            options.max_faces,
+            lambda done: ctx.progress(
+                _RENDER_SHARE + (_FUSE_SHARE - _RENDER_SHARE) * done, "fusing depth", None
+            ),
+        )
+    if len(mesh.faces) == 0:
+        raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
+    ctx.progress(0.98, "writing")
+    ply.write_mesh(ctx.out / "mesh.ply", mesh)
+    glb.write_mesh(ctx.out / "mesh.glb", mesh)
+    return {
+        "num_vertices": len(mesh.vertices),
+        "num_faces": len(mesh.faces),
+        "num_views": len(images),
+        "voxel": round(shells[0].voxel, 9),
+        "bounds": shells[0].bounds.as_dict(),
+        "shells": [
+            {"voxel": round(shell.voxel, 9), **shell.bounds.as_dict()} for shell in shells[1:]
+        ],
+    }
+
+
+def _empty(why: str) -> ExportError:
+    return ExportError(
+        f"The mesh is empty: {why}.",
+        code="empty_mesh",
+        hint="Train longer, or raise mesh.max_distance; a low PSNR in evaluate means that the "
+        "capture itself needs more overlap and light.",
+    )
+
+
+EXPORT = Export(
+    kind="mesh",
+    version=3,
+    reads=("depth",),
+    run=run,
+    options=MeshOptions,
+    artifacts=(
+        Artifact("mesh.glb", "mesh.glb", "model/gltf-binary", "any glTF viewer, Blender"),
+        Artifact(
+            "mesh.ply", "mesh.ply", "application/octet-stream", "MeshLab, CloudCompare, Blender"
+        ),
+    ),
+)

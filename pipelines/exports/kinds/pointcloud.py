@@ -1,0 +1,101 @@
+"""The point cloud: points with colour and normals from the depth of training views, as PLY.
+
+In the world frame of cameras.json. Views are spread over the capture and just large enough for the
+points wanted, so the work is known beforehand and an empty crop ends in an error instead of a
+search without end.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from pipelines.errors import ExportError
+from pipelines.exports.export import Export
+from pipelines.exports.options import CropOptions, reach_of
+from pipelines.stage import Artifact, StageContext
+
+if TYPE_CHECKING:
+    from pipelines.scene.trained_scene import TrainedScene
+
+_MAX_VIEWS = 48
+_RENDER_SHARE = 0.75
+
+
+class PointcloudOptions(CropOptions):
+    """The point cloud."""
+
+    num_points: int = Field(1_000_000, ge=1000, le=50_000_000, description="Points wanted.")
+    remove_outliers: bool = Field(True, description="Drop points far from their neighbours.")
+
+
+def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> dict[str, Any]:
+    """Make the cloud. Raises ExportError `empty_pointcloud` where no surface is in the crop."""
+    # Imported where it runs: the API reads this file too.
+    from pipelines.exports.formats import ply
+    from pipelines.exports.surface import cloud as clouds
+    from pipelines.exports.surface.views import (
+        known_depths,
+        lens_of_pixels,
+        pixels_for_points,
+        render_views,
+    )
+    from pipelines.scene.consistency import consistent
+
+    ctx.progress(0.0, "looking for the scene's bounds")
+    probes = scene.probe_views(ctx.check_cancelled)
+    subject = scene.bounds(options.max_distance, ctx.check_cancelled, probes)
+    bounds = scene.bounds(reach_of(options), ctx.check_cancelled, probes)
+    if subject is None or bounds is None:
+        raise _empty("no ray of the training views met a surface")
+    images = scene.training_images(_MAX_VIEWS)
+    pixels = pixels_for_points(options.num_points, len(images), probes, bounds)
+    lenses = [lens_of_pixels(scene.lens_of(image), pixels) for image in images]
+    known = known_depths(ctx.workspace, options.use_depth_maps)
+    with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
+        store = render_views(scene, images, lenses, Path(folder), ctx, _RENDER_SHARE, known)
+        ctx.progress(_RENDER_SHARE, "gathering points")
+        cloud = clouds.gather(store, bounds)
+        ctx.progress(0.8, f"checking {len(cloud)} points against all views")
+        cloud = cloud.take(consistent(cloud.points, store))
+    if options.remove_outliers:
+        ctx.progress(0.87, "removing outliers")
+        inner = subject.contains(cloud.points)
+        parts = [cloud.take(inner), cloud.take(~inner)]  # what is far is spread more widely
+        cloud = clouds.joined([clouds.without_outliers(part, bounds.focus) for part in parts])
+    if len(cloud) == 0:
+        raise _empty("no surface lies within the crop")
+    cloud = clouds.thinned(cloud, options.num_points, ctx.seed)
+    ctx.progress(0.92, "estimating normals")
+    normals = clouds.oriented_normals(cloud, bounds.focus)
+    ctx.progress(0.97, "writing")
+    ply.write_points(ctx.out / "pointcloud.ply", cloud.points, cloud.colors, normals)
+    return {"num_points": len(cloud), "num_views": len(images), "bounds": bounds.as_dict()}
+
+
+def _empty(why: str) -> ExportError:
+    return ExportError(
+        f"The point cloud is empty: {why}.",
+        code="empty_pointcloud",
+        hint="Raise pointcloud.max_distance, or train longer.",
+    )
+
+
+EXPORT = Export(
+    kind="pointcloud",
+    version=3,
+    reads=("depth",),
+    run=run,
+    options=PointcloudOptions,
+    artifacts=(
+        Artifact(
+            "pointcloud.ply",
+            "pointcloud.ply",
+            "application/octet-stream",
+            "MeshLab, CloudCompare, Blender",
+        ),
+    ),
+)

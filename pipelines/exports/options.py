@@ -1,0 +1,70 @@
+"""Options that exports have in common. Light: the API reads them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from pipelines.nerf.options.render import RenderConfig
+from pipelines.nerf.options.train import config_from_dict
+from pipelines.option_models import StageOptions, model_of
+
+if TYPE_CHECKING:
+    RenderOptions = StageOptions
+else:
+    RenderOptions = model_of(RenderConfig)
+
+
+class RenderingOptions(StageOptions):
+    """Common to the exports that render."""
+
+    render: RenderOptions = Field(
+        default_factory=lambda: RenderOptions(), description="What rendering leaves out."
+    )
+
+
+class ExtentOptions(StageOptions):
+    """What part of the scene is exported."""
+
+    extent: Literal["auto", "subject", "scene"] = Field(
+        "auto",
+        description="subject is what lies within max_distance; scene also what lies beyond it, up "
+        "to far_distance, more coarsely. auto is scene.",
+    )
+    max_distance: float = Field(
+        2.0,
+        gt=0,
+        le=1000,
+        description="How far the subject reaches from the cameras' focus, in units of the cameras' "
+        "mean distance to it.",
+    )
+    far_distance: float = Field(
+        18.0,
+        gt=0,
+        le=10_000,
+        description="Farthest surface of the scene that is kept, in the same unit.",
+    )
+
+
+class CropOptions(RenderingOptions, ExtentOptions):
+    """Common to mesh and point cloud."""
+
+    use_depth_maps: bool = Field(
+        False,
+        description="Let the depth maps of the stage depth vote on surfaces beside the trained "
+        "field.",
+    )
+
+
+def reach_of(options: ExtentOptions) -> float:
+    """How far the farthest surface that is kept may be, in the cameras' mean distances."""
+    if options.extent == "subject":
+        return options.max_distance
+    return max(options.max_distance, options.far_distance)
+
+
+def render_config(options: RenderingOptions) -> RenderConfig:
+    """What the renderer understands, from checked options."""
+    config: RenderConfig = config_from_dict(RenderConfig, options.render.model_dump())
+    return config

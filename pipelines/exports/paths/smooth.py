@@ -1,0 +1,136 @@
+"""A smooth camera path through captured poses.
+
+Poses are `world_from_camera` [N, 3, 4], OpenGL cameras, world units. The path is parametrised by
+arc length `s` in the metric of `pipelines.scene.capture_order`, which counts turning as well as
+moving. Rotations are unit quaternions (w, x, y, z).
+
+Where the cameras look at a point, the focus, two things are fitted by themselves beside position
+and rotation: the distance to it, and the direction in which each camera sees it. Averages of
+positions cut corners, and averages of rotations know nothing of what is looked at.
+
+This file knows only poses; lenses and rendering are left to who asks for the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.scene.cameras_file import PosedImage
+from pipelines.scene.capture_order import capture_order, turn_length
+from pipelines.scene.focus import find_focus
+from pipelines.scene.rotations import quaternions, rotation_between, rotation_matrices
+
+Floats = NDArray[np.float64]
+
+_SMOOTHING_SHARE = 1.0 / 30.0
+_OVERSAMPLING = 8
+_MIN_AGREEMENT = 1e-3
+"""A mean direction shorter than this is none: cameras that see the focus on opposite sides."""
+
+
+def smooth_flight(images: Sequence[PosedImage], num_frames: int) -> Floats:
+    """[num_frames, 3, 4] world poses along the captured ones, in the order of the walk."""
+    poses = np.asarray([image.world_from_camera for image in images], np.float64)
+    order = capture_order(
+        poses, [image.file for image in images], [image.timestamp_s for image in images]
+    )
+    return smooth_path(poses[order], num_frames, find_focus(poses))
+
+
+def smooth_path(poses: Floats, num_frames: int, focus: Floats | None = None) -> Floats:
+    """`num_frames` poses along a smooth path through `poses`, at nearly constant speed.
+
+    poses: [N, 3, 4] in walking order, N >= 1. Positions are a local linear fit along the arc
+    length with a Gaussian window of a thirtieth of the path (wider where poses are sparse), which
+    removes the shake of the hand and keeps the way; rotations are the window's mean quaternion.
+    focus: [3], what the cameras look at, where there is such a point. The distance to it is then
+    the window's own, so that a gap in the capture is passed around the subject and not through it;
+    and so is its direction in the camera: where all of the window's poses have the focus in their
+    pictures, so has the path.
+    Returns [num_frames, 3, 4] with exact rotations. Raises ValueError without poses or frames.
+    """
+    if len(poses) == 0 or num_frames < 1:
+        raise ValueError(f"a path needs poses and frames, got {len(poses)} and {num_frames}")
+    turn = turn_length(poses)
+    s = _arc_length(poses, turn)
+    if s[-1] <= 1e-9:
+        return np.repeat(poses[:1], num_frames, axis=0)
+    dense = _windowed(poses, s, np.linspace(0.0, s[-1], _OVERSAMPLING * num_frames), focus)
+    s_dense = _arc_length(dense, turn)
+    # Evenly spaced along the smoothed way: constant speed.
+    at = np.interp(
+        np.linspace(0.0, s_dense[-1], num_frames), s_dense, np.linspace(0.0, s[-1], len(dense))
+    )
+    return _windowed(poses, s, at, focus)
+
+
+def _arc_length(poses: Floats, turn: float) -> Floats:
+    """[N] length of the way up to each pose; `turn`: that of one radian."""
+    moved = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1)
+    q = quaternions(poses[:, :, :3])
+    turned = 2.0 * np.arccos(np.clip(np.abs((q[1:] * q[:-1]).sum(axis=1)), 0.0, 1.0))
+    length: Floats = np.concatenate(([0.0], np.cumsum(np.hypot(moved, turn * turned))))
+    return length
+
+
+def _windowed(poses: Floats, s: Floats, at: Floats, focus: Floats | None) -> Floats:
+    """Poses [M, 3, 4] at arc lengths `at` [M], from `poses` at `s` [N]."""
+    offset = s[None, :] - at[:, None]
+    # The window reaches the third nearest pose, so that a gap never leaves it empty.
+    third = np.partition(np.abs(offset), min(2, len(s) - 1), axis=1)[:, min(2, len(s) - 1)]
+    width = np.maximum(s[-1] * _SMOOTHING_SHARE, third)[:, None]
+    weight = np.exp(-0.5 * (offset / width) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    centers = poses[:, :, 3]
+    position = _local_line(weight, offset, centers)
+    q = quaternions(poses[:, :, :3])
+    outer = np.einsum("mn,ni,nj->mij", weight, q, q)
+    rotation = rotation_matrices(np.linalg.eigh(outer)[1][:, :, -1])
+    if focus is not None:
+        wanted = _local_line(weight, offset, np.linalg.norm(centers - focus, axis=1)[:, None])
+        away = position - focus
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        position = focus + away * np.where(length > 1e-9, wanted / np.maximum(length, 1e-9), 1.0)
+        rotation = _aimed(rotation, position, weight @ _directions_to(focus, poses), focus)
+    path: Floats = np.concatenate((rotation, position[:, :, None]), axis=2)
+    return path
+
+
+def _directions_to(focus: Floats, poses: Floats) -> Floats:
+    """[N, 3] unit directions to the focus in each camera's own axes; 0 for a camera in it."""
+    local = np.einsum("nji,nj->ni", poses[:, :, :3], focus - poses[:, :, 3])
+    length = np.linalg.norm(local, axis=1, keepdims=True)
+    directions: Floats = np.where(length > 1e-9, local / np.maximum(length, 1e-9), 0.0)
+    return directions
+
+
+def _aimed(rotation: Floats, position: Floats, wanted: Floats, focus: Floats) -> Floats:
+    """Rotations [M, 3, 3], turned the least way that brings the focus to the wanted directions.
+
+    wanted: [M, 3] in camera axes, means of unit vectors. A picture is a convex cone of directions,
+    so a mean over cameras that have the focus in theirs lies in it too. Where the mean is no
+    direction the rotation stays as it is.
+    """
+    length = np.linalg.norm(wanted, axis=1)
+    seen = _directions_to(focus, np.concatenate((rotation, position[:, :, None]), axis=2))
+    known = (length > _MIN_AGREEMENT) & (np.linalg.norm(seen, axis=1) > 0.5)
+    aimed = rotation.copy()
+    unit = wanted[known] / length[known, None]
+    aimed[known] = rotation[known] @ rotation_between(unit, seen[known])
+    return aimed
+
+
+def _local_line(weight: Floats, offset: Floats, values: Floats) -> Floats:
+    """[M, D]: at offset 0, the weighted least-squares line through values [N, D].
+
+    weight: [M, N], rows sum to 1. offset: [M, N].
+    """
+    mean_offset = (weight * offset).sum(axis=1, keepdims=True)
+    centred = offset - mean_offset
+    variance = (weight * centred**2).sum(axis=1, keepdims=True)
+    slope = (weight * centred) @ values / np.maximum(variance, 1e-18)
+    line: Floats = weight @ values - slope * mean_offset
+    return line

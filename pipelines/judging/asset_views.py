@@ -1,0 +1,183 @@
+"""What a delivered mesh or cloud shows from a camera: colour, where there is anything, how far.
+
+Cameras are `pipelines.nerf`'s, so that rays are those of the real lens, distortion and all.
+Cameras, vertices and points are in one frame, the world less an origin of the caller's choice,
+because float32 cannot hold geo-referenced coordinates; lengths are world units. Symbols: V
+vertices, F faces, P points, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import open3d
+import torch
+from numpy.typing import NDArray
+
+from pipelines.nerf.space.cameras import Cameras
+
+Floats = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+
+NEIGHBOURS = 6
+"""A sheet of evenly spread points gives each six neighbours at the spacing of the points."""
+WIDEST_SPACING = 3.0
+"""A lone point's spacing is at most so many medians, or it would hide half a picture."""
+MAX_RADIUS_PX = 6
+"""A point is drawn at most this large: what is right before the camera must not hide the rest."""
+_MAX_ANGLE_ERROR = 0.02
+
+# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
+_core: Any = open3d.core
+_tensor_geometry: Any = open3d.t.geometry
+
+
+@dataclass(frozen=True)
+class AssetView:
+    """color: [H, W, 3] float32, sRGB in [0, 1], 0 where nothing is. hit: [H, W].
+
+    distance: [H, W] float32 along the pixel's ray, world units, 0 where nothing is.
+    """
+
+    color: NDArray[np.float32]
+    hit: Bools
+    distance: NDArray[np.float32]
+
+    def z_depth(self, cameras: Cameras, index: int) -> NDArray[np.float32]:
+        """The distance along the camera's axis, [H, W]; `cameras` as it was drawn with."""
+        rays = cameras.image_rays(index)
+        forward = -cameras.scene_from_camera[index, :, 2]
+        along = (rays.directions @ forward).numpy().reshape(self.hit.shape)
+        return np.asarray(self.distance * along, np.float32)
+
+
+class MeshCaster:
+    """A mesh to be looked at; both sides of its faces show, as viewers draw them.
+
+    vertices: [V, 3]. faces: [F, 3], indices. colors: [V, 3] in [0, 1], or None for mid grey.
+    Raises ValueError for a mesh without faces.
+    """
+
+    def __init__(
+        self, vertices: Floats, faces: NDArray[np.integer[Any]], colors: Floats | None
+    ) -> None:
+        if len(faces) == 0:
+            raise ValueError("a mesh without faces shows nothing")
+        self._faces = np.ascontiguousarray(faces, np.uint32)
+        grey = np.full((len(vertices), 3), 0.5, np.float32)
+        self._colors = grey if colors is None else np.asarray(colors, np.float32)
+        self._scene = _tensor_geometry.RaycastingScene()
+        self._scene.add_triangles(
+            _core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
+            _core.Tensor.from_numpy(self._faces),
+        )
+
+    def view(self, cameras: Cameras, index: int) -> AssetView:
+        """What camera `index` sees."""
+        width, height = cameras.size[index].tolist()
+        rays = cameras.image_rays(index)
+        return self.along(rays.origins.numpy(), rays.directions.numpy(), (height, width))
+
+    def along(self, origins: Floats, directions: Floats, shape: tuple[int, ...]) -> AssetView:
+        """What rays [N, 3] with unit directions meet, as pictures of `shape`, N in all."""
+        rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
+        found = self._scene.cast_rays(_core.Tensor.from_numpy(np.ascontiguousarray(rays)))
+        distance = found["t_hit"].numpy()
+        hit = np.isfinite(distance)
+        corners = self._colors[self._faces[found["primitive_ids"].numpy()[hit]]]
+        u, v = found["primitive_uvs"].numpy()[hit].T
+        weights = np.stack([1.0 - u - v, u, v], axis=1)
+        color = np.zeros((len(rays), 3), np.float32)
+        color[hit] = np.einsum("nc,ncd->nd", weights, corners)
+        return AssetView(
+            color=color.reshape(*shape, 3),
+            hit=hit.reshape(shape),
+            distance=np.where(hit, distance, np.float32(0.0)).reshape(shape),
+        )
+
+
+def point_spacing(points: Floats) -> NDArray[np.float32]:
+    """How far apart points [P, 3] lie around each: [P], world units.
+
+    The mean distance to a point's six nearest, and at most three times the median of that. 0 for a
+    single point.
+    """
+    if len(points) < 2:
+        return np.zeros(len(points), np.float32)
+    values = _core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32))
+    search = _core.nns.NearestNeighborSearch(values)
+    search.knn_index()
+    _, squared = search.knn_search(values, min(NEIGHBOURS + 1, len(points)))
+    # The nearest is the point itself.
+    spacing = np.sqrt(np.maximum(squared.numpy()[:, 1:], 0.0)).mean(axis=1)
+    limited: NDArray[np.float32] = np.minimum(
+        spacing, WIDEST_SPACING * np.median(spacing), dtype=np.float32
+    )
+    return limited
+
+
+def cloud_view(
+    points: Floats, colors: Floats, radius: Floats, cameras: Cameras, index: int
+) -> AssetView:
+    """The cloud as discs that face the camera, the nearest of a pixel in front.
+
+    points: [P, 3]. colors: [P, 3] in [0, 1]. radius: [P], world units; drawn with at least half a
+    pixel and at most `MAX_RADIUS_PX`.
+    """
+    width, height = cameras.size[index].tolist()
+    pixels, z_depth, distance, which = _in_frame(points, cameras, index)
+    focal = float(cameras.focal[index].mean())
+    sides = np.clip(focal * radius[which] / np.maximum(z_depth, 1e-9), 0.5, MAX_RADIUS_PX)
+    first = np.floor(pixels).astype(np.int64)
+    reach = int(np.ceil(sides.max(initial=0.5)))
+    flats, members = [], []
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            # A point is less than a pixel's diagonal from its own pixel's corner: most are too
+            # small for most offsets.
+            near = np.flatnonzero(sides >= np.hypot(dx, dy) - 0.75)
+            cells = first[near] + (dx, dy)
+            off = np.linalg.norm(cells + 0.5 - pixels[near], axis=1)
+            drawn = (off <= sides[near]) | ((dx == 0) & (dy == 0))
+            drawn &= ((cells >= 0) & (cells < (width, height))).all(axis=1)
+            flats.append(cells[drawn, 1] * width + cells[drawn, 0])
+            members.append(near[drawn])
+    flat, member = np.concatenate(flats), np.concatenate(members)
+    # Far to near, so that of the points of one pixel the nearest is written last.
+    order = np.argsort(-distance[member], kind="stable")
+    flat, member = flat[order], member[order]
+    nearest = np.zeros(height * width, np.float32)
+    owner = np.full(height * width, -1, np.int64)
+    nearest[flat], owner[flat] = distance[member], which[member]
+    nearest, owner = nearest.reshape(height, width), owner.reshape(height, width)
+    hit = owner >= 0
+    color = np.zeros((height, width, 3), np.float32)
+    color[hit] = colors[owner[hit]]
+    return AssetView(color, hit, nearest)
+
+
+def _in_frame(
+    points: Floats, cameras: Cameras, index: int
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    """Of the points that the camera has in its frame: pixels [Q, 2], z-depth, distance, indices."""
+    places = torch.as_tensor(np.ascontiguousarray(points, np.float32))
+    rows = torch.full((len(places),), index, dtype=torch.int64)
+    pixels, z_depth = cameras.project(places, rows)
+    inside = ((pixels >= 0.0) & (pixels < cameras.size[index])).all(dim=-1)
+    which = torch.nonzero(inside).squeeze(-1)
+    toward = places[which] - cameras.scene_from_camera[index, :, 3]
+    distance = toward.norm(dim=-1)
+    # A point behind the camera, or beyond where the lens formula folds back, has a pixel too: one
+    # whose ray leads elsewhere.
+    ways = cameras.generate_rays(rows[which], pixels[which]).directions
+    error = (ways - toward / distance.clamp_min(1e-12)[:, None]).norm(dim=-1)
+    true = error < _MAX_ANGLE_ERROR
+    which = which[true]
+    return (
+        pixels[which].numpy(),
+        z_depth[which].numpy(),
+        distance[true].numpy(),
+        which.numpy(),
+    )

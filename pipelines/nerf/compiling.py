@@ -1,0 +1,299 @@
+"""Compiles the kernels of a job before the job waits for them.
+
+    python -m pipelines.nerf.compiling PART [--background] < list-of-options.json
+
+A part is a tiny job on made data: some depth maps, two steps of `train`, or one picture of
+`Renderer`. So whatever
+kernels those launch is compiled, with the types that they have in a job, and nothing here knows
+their names. numba compiles with one thread a process; `compile_kernels` therefore runs the parts in
+processes of their own, side by side, and on two cores nobody waits for more than the longer one.
+
+Files in the cache folder: `PART.lock` is held by who compiles, so that others wait instead of
+compiling the same; `PART.progress` says how far it is; `PART-KIND.done` says that all is compiled
+for options of a kind. Kinds differ where the types of a kernel's arguments may.
+
+A background compiler has the least priority and writes its process id into the lock. Who waits for
+it and sees that it gets less than half a processor ends it and compiles in its place: kernels that
+it had finished stay.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import fcntl
+import hashlib
+import json
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from llvmlite.binding import get_host_cpu_name  # type: ignore[import-untyped]
+
+from pipelines.nerf.data.images import ImageData
+from pipelines.nerf.engines.cpu.parts.runtime import (
+    CACHE_FOLDER,
+    count_as_compiling,
+    file_lock,
+    kernels_compiled,
+    kernels_known,
+)
+from pipelines.nerf.options.catalogue import find_method
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.options.train import TrainConfig, config_from_dict
+from pipelines.nerf.renderer import Renderer
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
+from pipelines.nerf.stereo.maps import find_depth_maps
+from pipelines.nerf.stereo.views import StereoView
+from pipelines.nerf.training.loop import train
+
+PARTS = ("stereo", "training", "rendering")
+OnProgress = Callable[[int, int], None]
+"""Receives the number of kernels that are compiled, and of those there are at most."""
+
+_log = logging.getLogger("nerfworks.nerf")
+_POLL_S = 0.1
+_PROGRESS_STEP_S = 0.2
+_PATIENCE_S = 2.0
+_MOST = {"log2_table_size": 10, "occupancy_resolution": 16, "num_steps": 64, "max_samples": 4096}
+"""Options of models that decide sizes only, and what is enough here."""
+_SIDE_PX, _NUM_IMAGES, _NUM_RAYS, _NUM_STEPS = 16, 4, 64, 2
+_SCENE = SceneTransform((0.0, 0.0, 0.0), 1.0)
+
+
+def kind_of(config: TrainConfig) -> str:
+    """Options whose kernels take arguments of the same types have the same kind.
+
+    Of numbers it counts whether they are zero, which switches things off; texts and switches count
+    as they are. The processor counts too: compiled code is for one.
+    """
+    values = [config.method, config.engine, _shape(dataclasses.asdict(config.model))]
+    machine = [sys.version_info[:2], get_host_cpu_name()]
+    text = json.dumps([values, machine], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _shape(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _shape(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_shape(item) for item in value]
+    return value if isinstance(value, bool | str | None) else value != 0
+
+
+def _marker(part: str, config: TrainConfig) -> Path:
+    return CACHE_FOLDER / f"{part}-{kind_of(config)}.done"
+
+
+def parts_to_compile(config: TrainConfig) -> list[str]:
+    """The parts that nobody has compiled on this machine so far."""
+    return [part for part in PARTS if not _marker(part, config).exists()]
+
+
+def compile_kernels(config: TrainConfig, on_progress: OnProgress) -> None:
+    """Have all kernels compiled that a job with these options launches on the CPU.
+
+    on_progress: called ten times a second while somebody compiles, never when all was there; may
+    raise, which ends the compilers that this call started.
+    The time counts in `runtime.compile_seconds`. A compiler that fails is logged and no error here:
+    the kernels are then compiled where they are used, and that may say why it failed.
+    """
+    begun = time.monotonic()
+    waiting = parts_to_compile(config)
+    started: dict[str, subprocess.Popen[bytes]] = {}
+    limit = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
+    try:
+        while waiting or any(process.poll() is None for process in started.values()):
+            running = sum(process.poll() is None for process in started.values())
+            if waiting and running < max(limit, 1):
+                part = waiting.pop(0)
+                started[part] = start_compiler(part, config)
+            else:
+                on_progress(*_progress_of(list(started)))
+                time.sleep(_POLL_S)
+    finally:
+        for part, process in started.items():
+            process.kill()
+            if status := process.wait():
+                _log.warning("the kernels for %s were not compiled: status %s", part, status)
+        if started:
+            count_as_compiling(time.monotonic() - begun)
+
+
+def start_compiler(part: str, config: TrainConfig) -> subprocess.Popen[bytes]:
+    """A process that compiles a part. It ends when this one does."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pipelines.nerf.compiling", part, "--parent", str(os.getpid())],
+        stdin=subprocess.PIPE,
+        cwd=Path(__file__).resolve().parents[2],
+    )
+    assert process.stdin is not None
+    with process.stdin:
+        process.stdin.write(json.dumps([dataclasses.asdict(config)]).encode())
+    return process
+
+
+def _progress_file(part: str) -> Path:
+    return CACHE_FOLDER / f"{part}.progress"
+
+
+def _progress_of(parts: Sequence[str]) -> tuple[int, int]:
+    done = known = 0
+    for part in parts:
+        try:
+            one, all_of_them = _progress_file(part).read_text().split()
+        except (OSError, ValueError):
+            continue  # not begun
+        done, known = done + int(one), known + int(all_of_them)
+    return done, known
+
+
+def run_part(part: str, config: TrainConfig) -> None:
+    """Launch in this process every kernel that the part of a job launches."""
+    tiny = _tiny(config)
+    cameras, images = _made_capture()
+    if part == "stereo":
+        _find_made_depth()
+    elif part == "training":
+        train(images, cameras, range(_NUM_IMAGES), tiny, seed=0)
+    else:
+        model = find_method(tiny.method).build(tiny.model, _NUM_IMAGES).eval()
+        Renderer(model, _SCENE, device="cpu").render(cameras, 0)
+
+
+def _tiny(config: TrainConfig) -> TrainConfig:
+    """The run shortened and its tables and grids made small: neither changes a type."""
+    return dataclasses.replace(
+        config,
+        max_steps=_NUM_STEPS,
+        max_seconds=0.0,
+        rays_per_step=_NUM_RAYS,
+        device="cpu",
+        model=_small(config.model),
+    )
+
+
+def _small(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_small(item) for item in value)
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value
+    changes = {}
+    for item in dataclasses.fields(value):
+        given = getattr(value, item.name)
+        changes[item.name] = min(given, _MOST[item.name]) if item.name in _MOST else _small(given)
+    return dataclasses.replace(value, **changes)
+
+
+def _made_capture() -> tuple[Cameras, ImageData]:
+    """Grey pictures by cameras on a ring of radius 1/2 that look at its middle, in scene space."""
+    poses = []
+    for index in range(_NUM_IMAGES):
+        angle = 2.0 * math.pi * index / _NUM_IMAGES
+        back = np.array([math.cos(angle), math.sin(angle), 0.0])
+        right = np.array([-math.sin(angle), math.cos(angle), 0.0])
+        poses.append(np.stack([right, [0.0, 0.0, 1.0], back, 0.5 * back], axis=-1))
+    cameras = Cameras.from_arrays(
+        world_from_camera=np.stack(poses),
+        scene=_SCENE,
+        widths=[_SIDE_PX] * _NUM_IMAGES,
+        heights=[_SIDE_PX] * _NUM_IMAGES,
+        focal=[(float(_SIDE_PX), float(_SIDE_PX))] * _NUM_IMAGES,
+        principal=[(_SIDE_PX / 2, _SIDE_PX / 2)] * _NUM_IMAGES,
+    )
+    grey = np.full((_SIDE_PX, _SIDE_PX, 3), 128, np.uint8)
+    return cameras, ImageData.from_arrays([grey] * _NUM_IMAGES)
+
+
+def _find_made_depth() -> None:
+    """Depth maps of three cameras in a row before a grey wall, whose points are known."""
+    lens = (float(_SIDE_PX), float(_SIDE_PX), _SIDE_PX / 2, _SIDE_PX / 2)
+    grey = np.full((_SIDE_PX, _SIDE_PX), 0.5, np.float32)
+    places = np.array([[-0.2, 0.0, 0.0], [0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    views = [StereoView(grey, lens, np.column_stack([np.eye(3), place])) for place in places]
+    wall = np.column_stack([np.linspace(-0.5, 0.5, 50), np.zeros(50), np.full(50, 2.0)])
+    find_depth_maps(views, StereoConfig(num_planes=16), wall)
+
+
+def load_compiled(config: TrainConfig) -> None:
+    """Load into this process what lies compiled, so that the first step need not."""
+    for part in PARTS:
+        if _marker(part, config).exists():
+            run_part(part, config)
+
+
+def _watch(part: str, parent: int) -> None:
+    """Say how far the compilation is; end this process when nobody is there to use it."""
+    path = _progress_file(part)
+    draft = path.with_name(f"{path.name}.{os.getpid()}")
+    while os.getppid() == parent:
+        if kernels_compiled():
+            draft.write_text(f"{kernels_compiled()} {kernels_known()}")
+            draft.replace(path)
+        time.sleep(_PROGRESS_STEP_S)
+    os._exit(1)
+
+
+def _hold_lock(path: Path, stack: contextlib.ExitStack) -> None:
+    """Take a part's lock, also from a background compiler that does not get on."""
+    while True:
+        try:
+            stack.enter_context(file_lock(path, fcntl.LOCK_EX | fcntl.LOCK_NB))
+            return
+        except BlockingIOError:
+            holder = path.read_text()
+            before, begun = _processor_seconds(holder), time.monotonic()
+            time.sleep(_PATIENCE_S)
+            after, passed = _processor_seconds(holder), time.monotonic() - begun
+            if before is None or after is None or path.read_text() != holder:
+                continue
+            if after - before < 0.5 * passed:
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.kill(int(holder), signal.SIGTERM)
+
+
+def _processor_seconds(pid: str) -> float | None:
+    """Processor time of a process so far; None where it is gone or the system does not say."""
+    try:
+        fields = Path(f"/proc/{int(pid)}/stat").read_text().rpartition(")")[2].split()
+    except (ValueError, OSError):
+        return None
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Compile one part for options of several kinds, or wait until another process has."""
+    parser = argparse.ArgumentParser(prog="python -m pipelines.nerf.compiling")
+    parser.add_argument("part", choices=PARTS)
+    parser.add_argument("--background", action="store_true", help="give way to all other work")
+    parser.add_argument("--parent", type=int, default=os.getppid(), help="end with this process")
+    chosen = parser.parse_args(arguments)
+    part: str = chosen.part
+    if chosen.background:
+        os.nice(19)
+    configs = [config_from_dict(TrainConfig, values) for values in json.loads(sys.stdin.read())]
+    watch = threading.Thread(target=_watch, args=(part, chosen.parent), daemon=True)
+    watch.start()
+    lock = CACHE_FOLDER / f"{part}.lock"
+    with contextlib.ExitStack() as stack:
+        _hold_lock(lock, stack)
+        lock.write_text(str(os.getpid()) if chosen.background else "")
+        for config in configs:
+            if not _marker(part, config).exists():
+                run_part(part, config)
+                _marker(part, config).touch()
+        _progress_file(part).unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    main()

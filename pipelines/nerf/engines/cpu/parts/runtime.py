@@ -1,0 +1,232 @@
+"""How the numba kernels are compiled, cached and spread over threads.
+
+Threads: kernels are single-threaded functions that release the interpreter's lock and take
+`(share, shares, ...)`; `run_threads` hands the shares to several Python threads.
+This needs no threading layer of numba's (no libgomp, no tbb), compiles in a third of the time, and
+several callers may run at once.
+
+Cache: compiled code is kept in NUMBA_CACHE_DIR, else NERFWORKS_HOME/numba, else
+~/.cache/nerfworks/numba, so that a read-only install compiles once and not in every process. Numba
+does not notice when a function called by a cached one changes; the folder therefore carries a
+digest of all sources that kernels are made of or freeze constants from. Processes that share it
+take turns (`_SharedCache`). `warm` fills it before anybody waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import inspect
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+from numba.core import event
+from numba.core.caching import FunctionCache
+
+SHARES_PER_THREAD = 8
+
+FROZEN_ROOMS = ("options", "space", "along_ray", "networks", "models", "engines/cpu")
+"""Rooms of pipelines/nerf that kernels come from: a global that a kernel reads is a constant of its
+compiled code, wherever it was imported from. `tests/test_architecture.py` holds the list."""
+
+# Everything but the promise that there are no NaN: a diverged training must show, not hide.
+FAST_MATH = {"contract", "reassoc", "nsz", "arcp", "afn"}
+_OPTIONS: dict[str, Any] = {
+    "fastmath": FAST_MATH,
+    "nogil": True,
+    "error_model": "numpy",
+    "boundscheck": False,
+}
+
+
+def kernel_version(nerf: Path) -> str:
+    """What changes with this numba and with every source that kernels may be made of.
+
+    nerf: the folder of the package pipelines.nerf.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    for room in FROZEN_ROOMS:
+        for source in sorted((nerf / room).rglob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    """The folder for compiled kernels: the first choice that can be written."""
+    name = f"kernels-{kernel_version(Path(__file__).resolve().parents[3])}"
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    home = os.environ.get("NERFWORKS_HOME")
+    if chosen:
+        base = Path(chosen)
+    elif home:
+        base = Path(home) / "numba"
+    else:
+        base = Path("~/.cache/nerfworks/numba").expanduser()
+    for candidate in (base / name, Path(tempfile.gettempdir()) / f"nerfworks-{os.getuid()}" / name):
+        try:
+            candidate.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(candidate, os.W_OK):
+            return candidate
+    raise OSError("no writable folder for compiled kernels: set NUMBA_CACHE_DIR to one")
+
+
+CACHE_FOLDER = _cache_folder()
+"""Where compiled kernels of these sources and this numba lie."""
+numba.config.CACHE_DIR = str(CACHE_FOLDER)  # type: ignore[attr-defined]
+
+
+@contextlib.contextmanager
+def file_lock(path: Path, operation: int) -> Iterator[None]:
+    """Hold a lock between processes, which the kernel drops when its holder dies.
+
+    operation: of `fcntl.flock`. Raises BlockingIOError where LOCK_NB asks for that.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, operation)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+class _SharedCache(FunctionCache):
+    """Numba's cache of one function, safe for several processes at once.
+
+    Numba numbers a new data file by the index that it has just read: two processes that save
+    different signatures of one function together may take the same number, and whoever loads one
+    later would run the other's code.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        with file_lock(CACHE_FOLDER / "lock", fcntl.LOCK_SH):
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with file_lock(CACHE_FOLDER / "lock", fcntl.LOCK_EX):
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+
+class _CompileWatch(event.Listener):
+    """Counts what numba compiles in this process; it holds its global lock meanwhile.
+
+    A kernel's compilation holds those of the functions that it calls: only the outermost count.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self.kernels = 0
+        self._depth = 0
+        self._begun = 0.0
+
+    def on_start(self, event: Any) -> None:
+        if self._depth == 0:
+            self._begun = time.monotonic()
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.monotonic() - self._begun
+            self.kernels += event.data["dispatcher"] in _launched
+
+
+_launched: list[Any] = []
+_watch = _CompileWatch()
+event.register("numba:compile", _watch)  # type: ignore[no-untyped-call]
+
+
+def compile_seconds() -> float:
+    """Seconds that this process spent on compiling so far, or waited for others that compiled for
+    it (`warm`); 0 where all came from the cache."""
+    return _watch.seconds
+
+
+def count_as_compiling(seconds: float) -> None:
+    """Add time in which this process waited for kernels that another one compiled."""
+    _watch.seconds += seconds
+
+
+def kernels_compiled() -> int:
+    """Kernels that this process compiled so far, without the functions that they call."""
+    return _watch.kernels
+
+
+def kernels_known() -> int:
+    """Kernels of all modules imported so far: what `run_threads` can launch."""
+    return len(_launched)
+
+
+def _jit(function: Callable[..., Any], **changes: Any) -> Any:
+    made = numba.njit(**(_OPTIONS | changes))(function)
+    # What `cache=True` does, with a class of our own.
+    made._cache = _SharedCache(function)  # type: ignore[no-untyped-call]
+    if list(inspect.signature(function).parameters)[:2] == ["share", "shares"]:
+        _launched.append(made)
+    return made
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """A kernel, or a function for use inside kernels: cached, without the interpreter's lock."""
+    return _jit(function)
+
+
+def exact(function: Callable[..., Any]) -> Any:
+    """As `compiled`, with rounding as written: for code that a reordering would break."""
+    return _jit(function, fastmath=False)
+
+
+def merged(function: Callable[..., Any]) -> Any:
+    """A step of a long kernel, compiled as a part of it.
+
+    `compiled` functions are optimised once by themselves and again in every caller, which makes
+    the first start of a kernel that is three calls deep take three times as long.
+    """
+    return _jit(function, inline="always")
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """A small function for the innermost loops, where a call would cost more than its body."""
+    return _jit(function, forceinline=True)
+
+
+def num_threads() -> int:
+    """Threads of a launch: as torch has them, at most one per processor."""
+    return max(1, min(os.cpu_count() or 1, torch.get_num_threads()))
+
+
+def run_threads(kernel: Callable[..., None], *arguments: Any, shares: int | None = None) -> None:
+    """Call `kernel(share, shares, *arguments)` for every share; return when all are done.
+
+    There are several shares to a thread, and a thread takes the next one when it is done with one,
+    so that a core that is also wanted elsewhere does less instead of keeping the others waiting. A
+    share writes what no other share writes, so results repeat whoever does it. Where shares cost
+    memory, `shares` says how many there are.
+    """
+    threads = num_threads()
+    if shares is None:
+        shares = 1 if threads == 1 else threads * SHARES_PER_THREAD
+    if threads == 1 or shares == 1:
+        for share in range(shares):
+            kernel(share, shares, *arguments)
+        return
+    waiting = iter(range(shares))  # `next` is atomic under the interpreter's lock
+
+    def work() -> None:
+        for share in waiting:
+            kernel(share, shares, *arguments)
+
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(work) for _ in range(threads - 1)]
+        work()
+    for other in others:
+        other.result()

@@ -1,0 +1,45 @@
+"""Every option of dense stereo and its default, once; no torch.
+
+Where the defaults come from: docs/surfaces.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipelines.nerf.options.parts import option
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """Depth maps from neighbouring pictures by plane sweep."""
+
+    long_side_px: int = option(
+        320, "Long side of the pictures that are compared.", unit="px", ge=64, le=4096
+    )
+    num_planes: int = option(128, "Depths tried per pixel, even in inverse depth.", ge=16, le=1024)
+    num_neighbours: int = option(8, "Pictures that each one is compared with.", ge=1, le=32)
+    window_radius: int = option(
+        3, "Half the side of the compared squares, without their middle.", unit="px", ge=1, le=15
+    )
+    smooth_small: float = option(
+        0.3, "Cost of a step to the next depth between two pixels.", ge=0.0, le=100.0
+    )
+    smooth_large: float = option(
+        5.0, "Cost of a jump in depth where the picture is plain.", ge=0.0, le=1000.0
+    )
+    edge_scale: float = option(
+        0.05,
+        "Brightness step, in [0, 1], that makes a jump in depth e times cheaper.",
+        ge=1e-3,
+        le=10.0,
+    )
+    best_angle_deg: float = option(
+        6.0, "Angle between two views of a point that is liked best.", unit="degrees", ge=0.5, le=45
+    )
+    min_agreeing: int = option(
+        2, "Neighbours whose own depth must agree for a depth to be kept.", ge=0, le=32
+    )
+    agree_within: float = option(
+        0.02, "Relative difference in depth up to which two views agree.", ge=1e-4, le=0.5
+    )

@@ -1,0 +1,108 @@
+"""Small learned corrections of the training cameras.
+
+Symbols: per camera six numbers [t, omega], zero at the start; t a translation in scene units, omega
+a rotation vector in radians, both in scene axes about the camera centre: origin += t (for SE(3) the
+left Jacobian times t), direction = R direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from pipelines.nerf.space.rays import Rays
+
+SERIES_BELOW = 1e-4
+"""Squared angle below which the series replace sin(a)/a and the like, which lose digits there."""
+
+
+def so3_exp(omega: Tensor) -> Tensor:
+    """Rotation vectors [..., 3] in radians to rotation matrices [..., 3, 3] (Rodrigues)."""
+    first, second, _ = _coefficients(omega)
+    skew = _skew(omega)
+    eye = torch.eye(3, dtype=omega.dtype, device=omega.device)
+    return eye + first * skew + second * (skew @ skew)
+
+
+def se3_exp(tangent: Tensor) -> tuple[Tensor, Tensor]:
+    """[t, omega] [..., 6] to rotation [..., 3, 3] and translation V(omega) t [..., 3].
+
+    Source: Sola et al., "A micro Lie theory", arXiv:1812.01537, eqs. 172 and 174.
+    """
+    shift, omega = tangent[..., :3], tangent[..., 3:]
+    _, second, third = _coefficients(omega)
+    skew = _skew(omega)
+    eye = torch.eye(3, dtype=omega.dtype, device=omega.device)
+    left = eye + second * skew + third * (skew @ skew)
+    return so3_exp(omega), (left @ shift[..., None]).squeeze(-1)
+
+
+class CameraOptimizer(nn.Module):
+    """Corrections [N, 6] of N training cameras, applied to rays while training.
+
+    mode: "off", "so3xr3" (rotation and translation apart) or "se3".
+    """
+
+    def __init__(
+        self,
+        num_cameras: int,
+        mode: str,
+        *,
+        translation_penalty: float = 1e-2,
+        rotation_penalty: float = 1e-3,
+    ) -> None:
+        super().__init__()
+        self.mode = mode
+        self.translation_penalty = translation_penalty
+        self.rotation_penalty = rotation_penalty
+        rows = 0 if mode == "off" else num_cameras
+        self.tangent = nn.Parameter(torch.zeros(rows, 6))
+
+    def apply_to(self, rays: Rays) -> Rays:
+        """The rays with each camera's correction; `camera_indices` are training indices."""
+        if self.mode == "off":
+            return rays
+        tangent = self.tangent.index_select(0, rays.camera_indices)
+        # Products of half precision would turn every ray by a thousandth.
+        with torch.autocast(tangent.device.type, enabled=False):
+            if self.mode == "se3":
+                rotation, shift = se3_exp(tangent)
+            else:
+                rotation, shift = so3_exp(tangent[:, 3:]), tangent[:, :3]
+            directions = (rotation @ rays.directions[..., None]).squeeze(-1)
+        return replace(rays, origins=rays.origins + shift, directions=directions)
+
+    def penalty(self) -> Tensor:
+        """Weighted mean lengths of the translations and rotations; a scalar."""
+        if self.mode == "off":
+            return self.tangent.sum()
+        moved = self.tangent[:, :3].norm(dim=-1).mean()
+        turned = self.tangent[:, 3:].norm(dim=-1).mean()
+        penalty: Tensor = self.translation_penalty * moved + self.rotation_penalty * turned
+        return penalty
+
+
+def _skew(omega: Tensor) -> Tensor:
+    """The matrix [..., 3, 3] of the cross product with omega."""
+    x, y, z = omega.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(
+        *omega.shape[:-1], 3, 3
+    )
+
+
+def _coefficients(omega: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3 for a = |omega|, each [..., 1, 1]."""
+    squared = omega.square().sum(dim=-1)[..., None, None]
+    is_small = squared < SERIES_BELOW
+    # The branch that `where` drops must stay finite, or its gradient is NaN.
+    safe = torch.where(is_small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    first = torch.where(is_small, 1.0 - squared / 6.0, torch.sin(angle) / angle)
+    second = torch.where(is_small, 0.5 - squared / 24.0, (1.0 - torch.cos(angle)) / safe)
+    third = torch.where(
+        is_small, 1.0 / 6.0 - squared / 120.0, (angle - torch.sin(angle)) / (safe * angle)
+    )
+    return first, second, third

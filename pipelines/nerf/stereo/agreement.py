@@ -1,0 +1,52 @@
+"""Whether other views' own depths agree with a depth map, in plain PyTorch.
+
+Symbols: depth [H, W] along the camera's axis (z), 0 where unknown; OpenCV cameras. The kernel twin
+is `engines.cpu.stereo.agreement`. The scheme is that of COLMAP's fusion and of the MVSNet filters.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+AGREE, SEE_THROUGH, HIDDEN = range(3)
+
+
+def count_votes(
+    depth: Tensor,
+    rays: tuple[Tensor, Tensor],
+    other_from_this: Tensor,
+    other: Tensor,
+    lens: Tensor,
+    within: float,
+    votes: Tensor,
+    sums: Tensor,
+) -> None:
+    """Add what one other view says of each pixel.
+
+    rays: x of each column [W] and y of each row [H] at z = 1. other_from_this: [3, 4].
+    other: [H', W'], its depth. lens: [4] fx, fy, cx, cy of the other view, pixel centres at + 0.5.
+    within: relative difference up to which depths agree.
+    votes: [3, H, W] int32: AGREE; SEE_THROUGH: the other view sees a surface behind the point, by
+    more than twice that; HIDDEN: one before it. sums: [H, W], of the depths in this view where it
+    agrees.
+    """
+    point = torch.stack([rays[0][None, :] * depth, rays[1][:, None] * depth, depth], dim=-1)
+    rotation, shift = other_from_this[:, :3], other_from_this[:, 3]
+    there = point @ rotation.T + shift
+    px, py, pz = there.unbind(-1)
+    fx, fy, cx, cy = lens
+    u, v = fx * px / pz + cx, fy * py / pz + cy
+    rows, columns = other.shape
+    seen = (depth > 0) & (pz > 0) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+    i, j = (torch.where(seen, w, 0.0).floor().long() for w in (u, v))
+    known = torch.where(seen, other[j, i], 0.0)
+    seen &= known > 0
+    gap = known / pz - 1.0
+    agree = seen & (gap.abs() <= within)
+    behind = seen & (gap > 2.0 * within)
+    votes[AGREE] += agree
+    votes[SEE_THROUGH] += behind
+    votes[HIDDEN] += seen & ~agree & (gap < 0)
+    moved = there * (known / pz)[..., None] - shift
+    sums += torch.where(agree, moved @ rotation[:, 2], 0.0)

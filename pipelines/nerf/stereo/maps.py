@@ -1,0 +1,180 @@
+"""Depth maps of a capture from its pictures alone: plane sweep, aggregation, votes.
+
+Symbols: V views. Depth is along the camera's axis (z), world units, 0 where it is not known. The
+kernels of `engines.cpu.stereo` compute, whatever else the machine has. What they are used for:
+docs/surfaces.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipelines.nerf.engines.cpu.stereo.aggregation import aggregate_fast
+from pipelines.nerf.engines.cpu.stereo.agreement import count_votes_fast
+from pipelines.nerf.engines.cpu.stereo.matching import matching_cost_fast
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.aggregation import jump_weights
+from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
+from pipelines.nerf.stereo.matching import plane_homographies
+from pipelines.nerf.stereo.neighbours import choose_neighbours, depth_range, spread_apart
+from pipelines.nerf.stereo.views import StereoView, camera_extent
+
+Floats = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+_MAX_POINTS = 4000
+_PROBE_VIEWS, _PROBE_LONG_SIDE, _PROBE_NEIGHBOURS, _PROBE_PLANES = 32, 160, 6, 160
+_PROBE_NEAREST = 0.1
+"""The nearest surface tried where nothing is known, in units of the cameras' extent."""
+_PROBE_FARTHEST = 100.0
+_PROBE_SHARE = 0.15
+_VOTE_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """z: [H, W] float32, 0 where unknown. votes: [H, W] uint8, views that agree with each depth."""
+
+    z: NDArray[np.float32]
+    votes: NDArray[np.uint8]
+
+
+def find_depth_maps(
+    views: Sequence[StereoView],
+    config: StereoConfig,
+    points: Floats | None = None,
+    on_progress: Progress = lambda fraction, message: None,
+) -> list[DepthMap]:
+    """A depth map for each view, agreed upon by others; empty where a view has no neighbours.
+
+    points: [P, 3], world: what is known of the scene, as from structure from motion; None has a
+    coarse pass over some views look for them. on_progress: fraction and message; may raise.
+    """
+    begun = 0.0
+    if points is None or len(points) < _MAX_POINTS // 100:
+        points = find_points(views, config, lambda f, text: on_progress(_PROBE_SHARE * f, text))
+        begun = _PROBE_SHARE
+    points = _thinned(points)
+    neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
+    ranges = [depth_range(view, points) for view in views]
+    known = [item for item in ranges if item is not None]
+    typical = (
+        (float(np.median([near for near, _ in known])), float(np.median([far for _, far in known])))
+        if known
+        else None
+    )
+    raw: list[NDArray[np.float32]] = []
+    for index, view in enumerate(views):
+        limits = ranges[index] or typical
+        others = [views[other] for other in neighbours[index]]
+        raw.append(_sweep(view, others, limits, config))
+        share = (index + 1) / len(views) * (1.0 - begun - _VOTE_SHARE)
+        on_progress(begun + share, f"depth {index + 1}/{len(views)}")
+    maps = []
+    for index in range(len(views)):
+        maps.append(agreed(index, views, raw, neighbours[index], config))
+        on_progress(1.0 - _VOTE_SHARE * (1.0 - (index + 1) / len(views)), "comparing depths")
+    return maps
+
+
+def find_points(views: Sequence[StereoView], config: StereoConfig, on_progress: Progress) -> Floats:
+    """Some points [P, 3] on the scene's surfaces, from small pictures of some views."""
+    picked = np.unique(np.linspace(0, len(views) - 1, _PROBE_VIEWS).round().astype(int))
+    longest = max(views[0].picture.shape)
+    factor = max(1, round(longest / _PROBE_LONG_SIDE))
+    some = [views[index].reduced(factor) for index in picked]
+    neighbours = spread_apart(some, _PROBE_NEIGHBOURS)
+    near = _PROBE_NEAREST * camera_extent(some)
+    coarse = StereoConfig(num_planes=_PROBE_PLANES, agree_within=2 * config.agree_within)
+    raw = []
+    for index, view in enumerate(some):
+        others = [some[other] for other in neighbours[index]]
+        raw.append(_sweep(view, others, (near, _PROBE_FARTHEST * near / _PROBE_NEAREST), coarse))
+        on_progress((index + 1) / len(some), f"looking for surfaces {index + 1}/{len(some)}")
+    found = [np.zeros((0, 3))]
+    for index, view in enumerate(some):
+        kept = agreed(index, some, raw, neighbours[index], coarse)
+        found.append(back_project(view, kept.z))
+    return np.concatenate(found)
+
+
+def back_project(view: StereoView, z: NDArray[np.float32]) -> Floats:
+    """World points [P, 3] of the pixels whose depth is known."""
+    x, y = view.rays()
+    row, column = np.nonzero(z > 0)
+    depth = z[row, column].astype(np.float64)
+    local = np.stack([x[column] * depth, y[row] * depth, depth], axis=-1)
+    world: Floats = local @ view.world_from_camera[:, :3].T + view.center
+    return world
+
+
+def _thinned(points: Floats) -> Floats:
+    if len(points) <= _MAX_POINTS:
+        return points
+    thinned: Floats = points[np.linspace(0, len(points) - 1, _MAX_POINTS).astype(int)]
+    return thinned
+
+
+def _sweep(
+    view: StereoView,
+    others: Sequence[StereoView],
+    limits: tuple[float, float] | None,
+    config: StereoConfig,
+) -> NDArray[np.float32]:
+    """The view's own opinion, [H, W] float32, before others are asked."""
+    if not others or limits is None:
+        return np.zeros(view.picture.shape, np.float32)
+    near, far = limits
+    inverse = torch.linspace(1.0 / far, 1.0 / near, config.num_planes, dtype=torch.float64)
+    homographies = plane_homographies(
+        torch.from_numpy(view.matrix()),
+        torch.from_numpy(np.stack([other.matrix() for other in others])),
+        torch.from_numpy(np.stack([other.from_other(view) for other in others])).double(),
+        inverse,
+    )
+    pictures = np.stack([other.picture for other in others])
+    reference = np.maximum(view.picture, 0.0)
+    cost = matching_cost_fast(
+        reference, pictures, homographies.numpy().astype(np.float32), config.window_radius
+    )
+    weights = jump_weights(torch.from_numpy(reference), config.edge_scale).numpy()
+    planes, _ = aggregate_fast(cost, weights, config.smooth_small, config.smooth_large)
+    step = float(inverse[1] - inverse[0])
+    z = 1.0 / (float(inverse[0]) + planes.astype(np.float64) * step)
+    return np.where(view.picture >= 0.0, z, 0.0).astype(np.float32)
+
+
+def agreed(
+    index: int,
+    views: Sequence[StereoView],
+    depths: Sequence[NDArray[np.float32]],
+    neighbours: Sequence[int],
+    config: StereoConfig,
+) -> DepthMap:
+    """A view's depths that enough neighbours confirm, and not more see through; averaged."""
+    view, depth = views[index], depths[index]
+    votes = np.zeros((3, *depth.shape), np.int32)
+    sums = np.zeros(depth.shape, np.float32)
+    rays = view.rays()
+    for other in neighbours:
+        count_votes_fast(
+            depth,
+            rays,
+            views[other].from_other(view),
+            depths[other],
+            np.array(views[other].lens, np.float32),
+            config.agree_within,
+            votes,
+            sums,
+        )
+    kept = (depth > 0) & (votes[AGREE] >= config.min_agreeing) & (votes[AGREE] > votes[SEE_THROUGH])
+    mean = (depth + sums) / (1.0 + votes[AGREE])
+    return DepthMap(
+        np.where(kept, mean, 0.0).astype(np.float32),
+        np.where(kept, votes[AGREE], 0).astype(np.uint8),
+    )

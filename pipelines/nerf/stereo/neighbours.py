@@ -1,0 +1,101 @@
+"""Which views a view is compared with, and how far its surfaces may be.
+
+Both follow from 3D points that are known beforehand: of structure from motion, or of a first coarse
+pass. Symbols: V views, P points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.nerf.stereo.views import StereoView, camera_extent
+
+Floats = NDArray[np.float64]
+
+_BELOW_DEG, _ABOVE_DEG = 2.0, 10.0
+"""How fast the liking for an angle falls below and above the best one."""
+_MAX_AXIS_DEG = 45.0
+_LEAST_SCORE = 0.02
+_MIN_POINTS = 20
+_NEAREST, _FARTHEST = 0.6, 3.0
+"""Beyond the points' own range: surfaces without texture have no points."""
+_NEAR_PERCENTILE, _FAR_PERCENTILE = 1.0, 99.0
+
+
+def choose_neighbours(
+    views: Sequence[StereoView], points: Floats, count: int, best_angle_deg: float
+) -> list[list[int]]:
+    """For each view, at most `count` others that see the same points from a good angle.
+
+    points: [P, 3]. The score of a pair is the share of the view's points that the other sees too,
+    each weighted by exp(-(angle - best)^2 / (2 s^2)) of the angle at the point between both, with s
+    2 degrees below the best angle and 10 above. Source: MVSNet, arXiv:1804.02505, section 4.1.
+    """
+    centers = np.array([view.center for view in views])
+    axes = np.array([view.axis for view in views])
+    shown = np.array([view.seen(points)[1] for view in views])
+    toward = points[None] - centers[:, None]
+    toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-12)
+    facing = axes @ axes.T > np.cos(np.radians(_MAX_AXIS_DEG))
+    chosen = []
+    for index in range(len(views)):
+        mine = shown[index]
+        if not mine.any():
+            chosen.append(_nearest(centers, facing, index, count))
+            continue
+        cosines = np.einsum("vpc,pc->vp", toward[:, mine], toward[index, mine])
+        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+        spread = np.where(angles < best_angle_deg, _BELOW_DEG, _ABOVE_DEG)
+        liked = np.exp(-0.5 * ((angles - best_angle_deg) / spread) ** 2) * shown[:, mine]
+        score = liked.mean(axis=1) * facing[index]
+        score[index] = 0.0
+        order = np.argsort(-score, kind="stable")[:count]
+        chosen.append([int(other) for other in order if score[other] > _LEAST_SCORE])
+    return chosen
+
+
+def _nearest(centers: Floats, facing: NDArray[np.bool_], index: int, count: int) -> list[int]:
+    """The nearest views that look the same way, for a view that no known point is in."""
+    distance = np.linalg.norm(centers - centers[index], axis=1)
+    distance[~facing[index]] = np.inf
+    distance[index] = np.inf
+    order = np.argsort(distance, kind="stable")[:count]
+    return [int(other) for other in order if np.isfinite(distance[other])]
+
+
+def depth_range(view: StereoView, points: Floats) -> tuple[float, float] | None:
+    """(nearest, farthest) depth worth trying, world units; None where too few points tell."""
+    depths, shown = view.seen(points)
+    if shown.sum() < _MIN_POINTS:
+        return None
+    near, far = np.percentile(depths[shown], (_NEAR_PERCENTILE, _FAR_PERCENTILE))
+    return _NEAREST * float(near), _FARTHEST * float(far)
+
+
+def spread_apart(views: Sequence[StereoView], count: int) -> list[list[int]]:
+    """Neighbours where nothing is known of the scene yet: at baselines of all useful lengths.
+
+    Of the views that look nearly the same way, `count` at distances even in logarithm from 1/50 to
+    1/3 of the cameras' extent.
+    """
+    centers = np.array([view.center for view in views])
+    axes = np.array([view.axis for view in views])
+    extent = camera_extent(views)
+    wanted = extent * np.geomspace(1.0 / 50.0, 1.0 / 3.0, count)
+    chosen = []
+    for index in range(len(views)):
+        distance = np.linalg.norm(centers - centers[index], axis=1)
+        usable = axes @ axes[index] > np.cos(np.radians(_MAX_AXIS_DEG))
+        usable &= distance > extent * 1e-4
+        found: list[int] = []
+        for length in wanted:
+            gap = np.where(usable, np.abs(np.log(np.maximum(distance, 1e-12) / length)), np.inf)
+            best = int(gap.argmin())
+            if np.isfinite(gap[best]):
+                found.append(best)
+                usable[best] = False
+        chosen.append(found)
+    return chosen

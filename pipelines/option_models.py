@@ -1,0 +1,104 @@
+"""Options as pydantic models: what all have in common, and models of the library's dataclasses.
+
+`pipelines.nerf` knows nothing of pydantic: its options are dataclasses whose fields carry `help`,
+`unit` and bounds in their metadata. `model_of` gives the model with the same fields, defaults and
+bounds. No torch is imported.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from pipelines.nerf.options.parts import allowed_names
+from pipelines.nerf.options.train import TrainConfig, default_train_config
+from pipelines.nerf.plugins import Method
+
+
+class StageOptions(BaseModel):
+    """Common ground: unknown keys are refused, values are checked, instances are frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+def _field_of(
+    annotation: Any, field: dataclasses.Field[Any], default: Any = None
+) -> tuple[Any, Any]:
+    """A dataclass field as pydantic wants it: (annotation, FieldInfo).
+
+    default: plain, in place of the field's own.
+    """
+    meta = dict(field.metadata)
+    description = meta.get("help", "")
+    if "unit" in meta:
+        description = f"{description} Unit: {meta['unit']}."
+    bounds = {key: meta[key] for key in ("ge", "le") if key in meta}
+    if "choices" in meta:
+        annotation = Literal[allowed_names(meta)]
+        bounds = {}
+    elif typing.get_origin(annotation) is tuple:
+        (item, *_) = typing.get_args(annotation)
+        item_model = model_of(item) if dataclasses.is_dataclass(item) else item
+        inner: Any = Annotated[item_model, Field(**bounds)] if bounds else item_model
+        annotation = Annotated[tuple[inner, ...], Field(min_length=1, max_length=8)]
+        bounds = {}
+    elif dataclasses.is_dataclass(annotation):
+        annotation = model_of(annotation)
+    if default is None and field.default_factory is not dataclasses.MISSING:
+        default = _plain(field.default_factory())
+    if default is not None:
+        return annotation, Field(default_factory=lambda: default, description=description, **bounds)
+    return annotation, Field(default=field.default, description=description, **bounds)
+
+
+def _plain(value: Any) -> Any:
+    """A dataclass, or a tuple of them, as plain data."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, tuple):
+        return tuple(_plain(item) for item in value)
+    return value
+
+
+_MODELS: dict[tuple[type, str], type[StageOptions]] = {}
+
+
+def model_of(cls: Any, method: Method | None = None) -> type[StageOptions]:
+    """The pydantic model with the fields, defaults and bounds of a dataclass.
+
+    method: for `TrainConfig`, whose own options its `model` holds.
+    """
+    key = (cls, "" if method is None else method.name)
+    if key not in _MODELS:
+        name = cls.__name__.replace("Config", "Options")
+        hints = typing.get_type_hints(cls)
+        fields: dict[str, Any] = {
+            field.name: _field_of(hints[field.name], field) for field in dataclasses.fields(cls)
+        }
+        if method is not None:
+            name += "".join(part.title() for part in method.name.split("-"))
+            fields |= _fields_of_method(method)
+        _MODELS[key] = create_model(name, __base__=StageOptions, __doc__=cls.__doc__, **fields)
+    return _MODELS[key]
+
+
+def _fields_of_method(method: Method) -> dict[str, Any]:
+    """The fields of `TrainConfig` in which one method differs from another."""
+    defaults = default_train_config(method.name)
+    fields: dict[str, Any] = {
+        "method": (Literal[method.name], Field(method.name, description=method.summary)),
+        "model": (
+            model_of(method.config),
+            Field(
+                default_factory=lambda: _plain(defaults.model), description="The model's options."
+            ),
+        ),
+    }
+    for name in method.train:
+        item = next(field for field in dataclasses.fields(TrainConfig) if field.name == name)
+        value = _plain(getattr(defaults, name))
+        fields[name] = _field_of(typing.get_type_hints(TrainConfig)[name], item, value)
+    return fields

@@ -1,0 +1,77 @@
+"""Depth maps of a capture in files: what the stage `depth` writes and later ones read.
+
+`maps.json` names each image with its map's lens; `maps/000000.npz` holds the map. Maps are those of
+undistorted cameras in the images' places, in the world frame; depth is along the camera's axis.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.scene.depth_views import Pinhole
+
+INDEX = "maps.json"
+_FOLDER = "maps"
+
+
+@dataclass(frozen=True)
+class MappedImage:
+    """An image that has a map. file: as in `cameras.json`. lens: of the map."""
+
+    file: str
+    lens: Pinhole
+
+
+class DepthMapsWriter:
+    """Writes maps one by one; `close` makes them a set that can be read."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        (folder / _FOLDER).mkdir(parents=True, exist_ok=True)
+        self._images: list[MappedImage] = []
+
+    def append(self, file: str, lens: Pinhole, found: DepthMap) -> None:
+        """The map of one more image. Half precision, relative to the map's median: 0.05 %."""
+        known = found.z > 0
+        unit = float(np.median(found.z[known])) if known.any() else 1.0
+        path = self._folder / _FOLDER / f"{len(self._images):06d}.npz"
+        relative = (found.z / np.float32(unit)).astype(np.float16)
+        np.savez_compressed(path, z=relative, unit=np.float64(unit), votes=found.votes)
+        self._images.append(MappedImage(file, lens))
+
+    def close(self) -> None:
+        """Write the index."""
+        rows = [{"file": item.file, "lens": asdict(item.lens)} for item in self._images]
+        (self._folder / INDEX).write_text(json.dumps({"images": rows}, indent=1), "utf-8")
+
+
+class DepthMapsFile:
+    """The maps that a folder holds, read one at a time. Raises ValueError for a broken index."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        try:
+            rows = json.loads((folder / INDEX).read_text("utf-8"))["images"]
+            self.images = [MappedImage(row["file"], Pinhole(**row["lens"])) for row in rows]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{folder / INDEX} is no list of depth maps: {error}") from error
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def read(self, index: int) -> DepthMap:
+        """The map of `images[index]`."""
+        with np.load(self._folder / _FOLDER / f"{index:06d}.npz", allow_pickle=False) as held:
+            z: NDArray[np.float32] = held["z"].astype(np.float32) * np.float32(held["unit"])
+            return DepthMap(z, held["votes"])
+
+    def __iter__(self) -> Iterator[tuple[MappedImage, DepthMap]]:
+        for index, image in enumerate(self.images):
+            yield image, self.read(index)

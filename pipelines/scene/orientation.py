@@ -1,0 +1,143 @@
+"""From a reconstruction's arbitrary frame to ours: gravity along -Z, centred, cameras in [-1, 1]^3.
+
+Symbols: N cameras; `world_from_camera` is [N, 3, 4] in OpenGL axes (+X right, +Y up, looks along
+-Z) unless a name says `opencv` (+X right, +Y down, looks along +Z). X, Y, Z below are a camera's
+axes in the world: the columns of its rotation. Everything is float64.
+
+A phone is held so that its picture is upright: the X axes of its cameras are level, however far
+it is tipped up or down. The direction most orthogonal to all X axes is therefore vertical, even
+where every camera looks down. That is nerfstudio's `vertical` (cameras/camera_utils.py,
+auto_orient_and_center_poses), here with weights that make a few rolled cameras harmless.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipelines.scene.focus import find_focus
+
+Array = npt.NDArray[np.float64]
+
+_MIN_TURN = 0.17
+"""Below this root mean square of the second axis (about 10 degrees), X axes are parallel."""
+_MIN_SIGN = 0.1
+"""A mean camera axis this short along the vertical says nothing about which end is up."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale * rotation @ x + translation. rotation: [3, 3], det +1. translation: [3]."""
+
+    rotation: Array
+    translation: Array
+    scale: float
+
+    def apply_to_points(self, points: Array) -> Array:
+        """points: [..., 3] in the old frame, to the new frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def apply_to_directions(self, directions: Array) -> Array:
+        """directions: [..., 3], turned only."""
+        return directions @ self.rotation.T
+
+    def apply_to_cameras(self, world_from_camera: Array) -> Array:
+        """[N, 3, 4] to [N, 3, 4]: centres are moved, rotations stay orthonormal."""
+        rotation = self.rotation @ world_from_camera[:, :, :3]
+        centers = self.apply_to_points(world_from_camera[:, :, 3])
+        return np.concatenate([rotation, centers[:, :, None]], axis=2)
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """How the world was turned and centred. up_from: vertical, camera_up or none.
+
+    centered_on: focus (the point that the cameras look at) or centers (their mean).
+    """
+
+    similarity: Similarity
+    up_from: str
+    centered_on: str
+
+
+def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
+    """[N, 3, 4] with OpenCV camera axes to the same poses with OpenGL camera axes."""
+    flipped: Array = world_from_camera_opencv * np.array([1.0, -1.0, -1.0, 1.0])
+    return flipped
+
+
+def find_up(world_from_camera: Array) -> tuple[Array, str]:
+    """The direction away from gravity, [3] unit, and how it was found: vertical or camera_up.
+
+    Raises ValueError where there are no cameras.
+    """
+    if len(world_from_camera) == 0:
+        raise ValueError("no cameras to find the vertical from")
+    x_axes = world_from_camera[:, :, 0]
+    mean_up: Array = world_from_camera[:, :, 1].mean(axis=0)
+    _, singular, rows = np.linalg.svd(x_axes, full_matrices=True)
+    if len(x_axes) >= 2 and singular[1] >= _MIN_TURN * np.sqrt(len(x_axes)):
+        up = _most_orthogonal(x_axes, rows[2])
+        return up * _sign_of_up(up, world_from_camera), "vertical"
+    level = mean_up - rows[0] * float(mean_up @ rows[0])
+    length = float(np.linalg.norm(level))
+    if length < _MIN_SIGN:
+        return np.array([0.0, 0.0, 1.0]), "camera_up"
+    return level / length, "camera_up"
+
+
+def _most_orthogonal(axes: Array, start: Array) -> Array:
+    """The unit vector u that minimises sum |axis . u|, by reweighted least squares.
+
+    axes: [N, 3] unit. start: [3] unit, the least squares answer. The absolute value, not the
+    square, so that a few cameras rolled by 90 degrees do not tilt the rest.
+    """
+    up = start
+    for _ in range(20):
+        weights = 1.0 / np.maximum(np.abs(axes @ up), 1e-3)
+        _, _, rows = np.linalg.svd(axes * np.sqrt(weights)[:, None], full_matrices=False)
+        if abs(float(rows[2] @ up)) > 1.0 - 1e-12:
+            break
+        up = rows[2]
+    return np.asarray(up, np.float64)
+
+
+def _sign_of_up(up: Array, world_from_camera: Array) -> float:
+    """+1 or -1: cameras' own up decides; where they look straight down, their gaze does."""
+    along_up = float(world_from_camera[:, :, 1].mean(axis=0) @ up)
+    if abs(along_up) >= _MIN_SIGN:
+        return 1.0 if along_up > 0 else -1.0
+    backwards = float(world_from_camera[:, :, 2].mean(axis=0) @ up)
+    return 1.0 if backwards >= 0 else -1.0
+
+
+def rotation_to_z(up: Array) -> Array:
+    """The smallest rotation [3, 3] that turns the unit vector `up` [3] to +Z."""
+    target = np.array([0.0, 0.0, 1.0])
+    cosine = float(up @ target)
+    if cosine < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = np.cross(up, target)
+    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    rotation: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    return rotation
+
+
+def normalise(world_from_camera: Array, *, orient: bool = True) -> Normalisation:
+    """The similarity that puts a reconstruction of unknown frame and scale into ours.
+
+    world_from_camera: [N, 3, 4], OpenGL axes. Afterwards gravity points along -Z (if `orient`),
+    the origin is the focus, or else the mean of the camera centres, and the largest absolute
+    coordinate of a camera centre is 1. Cameras in one single point keep their scale.
+    """
+    up, up_from = find_up(world_from_camera) if orient else (np.array([0.0, 0.0, 1.0]), "none")
+    rotation = rotation_to_z(up)
+    focus = find_focus(world_from_camera)
+    centers = world_from_camera[:, :, 3]
+    center = centers.mean(axis=0) if focus is None else focus
+    reach = float(np.abs((centers - center) @ rotation.T).max(initial=0.0))
+    scale = 1.0 / reach if reach > 1e-12 else 1.0
+    similarity = Similarity(rotation=rotation, translation=-scale * rotation @ center, scale=scale)
+    return Normalisation(similarity, up_from, "centers" if focus is None else "focus")

@@ -1,0 +1,86 @@
+"""The pictures of a capture as stereo wants them: undistorted, grey, small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipelines.nerf.space.lenses import CAMERA_MODELS, distort
+from pipelines.nerf.stereo.views import StereoView
+from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.scene.depth_views import Pinhole
+
+_OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
+
+
+def stereo_view(root: Path, image: PosedImage, lens: Intrinsics, long_side_px: int) -> StereoView:
+    """An image of a capture, reduced to `long_side_px` and freed of its lens's distortion.
+
+    root: what the image's paths are relative to. Pixels that the image or its mask does not have
+    are negative.
+    """
+    pinhole = Pinhole.of(lens, min(long_side_px, max(lens.width, lens.height)))
+    size = (pinhole.width, pinhole.height)
+    with Image.open(root / image.file) as opened:
+        opened.draft("L", size)
+        grey = opened.convert("L").resize(size, Image.Resampling.BOX)
+    picture = np.asarray(grey, np.float32) / np.float32(255.0)
+    if image.mask is not None:
+        with Image.open(root / image.mask) as opened:
+            usable = opened.convert("L").resize(size, Image.Resampling.NEAREST)
+        picture = np.where(np.asarray(usable) >= 128, picture, np.float32(-1.0))
+    pose = np.asarray(image.world_from_camera, np.float64)
+    turned = np.column_stack([pose[:, :3] @ _OPENCV_AXES, pose[:, 3]])
+    shown = _undistorted(picture, lens, pinhole)
+    return StereoView(shown, (pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy), turned)
+
+
+def undistorted_picture(
+    root: Path, image: PosedImage, lens: Intrinsics, pinhole: Pinhole
+) -> NDArray[np.uint8]:
+    """An image of a capture in colour, as that pinhole sees it, [H, W, 3]; black beyond it."""
+    size = (pinhole.width, pinhole.height)
+    with Image.open(root / image.file) as opened:
+        opened.draft("RGB", size)
+        picture = np.asarray(opened.convert("RGB").resize(size, Image.Resampling.BOX), np.float32)
+    channels = [_undistorted(picture[..., channel], lens, pinhole) for channel in range(3)]
+    shown: NDArray[np.uint8] = np.rint(np.clip(np.stack(channels, axis=-1), 0, 255)).astype(
+        np.uint8
+    )
+    return shown
+
+
+def _undistorted(
+    picture: NDArray[np.float32], lens: Intrinsics, pinhole: Pinhole
+) -> NDArray[np.float32]:
+    """The picture [H, W] as the pinhole would show it; negative where it has nothing."""
+    terms = (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2)
+    if lens.model == "PINHOLE" or (lens.model == "OPENCV" and not any(terms)):
+        return picture
+    height, width = picture.shape
+    directions = torch.from_numpy(pinhole.directions() * np.array([1.0, -1.0, -1.0]))
+    model = CAMERA_MODELS.index(lens.model)
+    flat = directions.reshape(-1, 3)
+    plane = distort(
+        flat,
+        torch.tensor([terms], dtype=torch.float64).expand(len(flat), -1),
+        torch.full((len(flat),), model),
+        (model,),
+    )
+    sx, sy = width / lens.width, height / lens.height
+    u = (plane[:, 0].numpy() * lens.fl_x + lens.cx) * sx - 0.5
+    v = (plane[:, 1].numpy() * lens.fl_y + lens.cy) * sy - 0.5
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    i = np.clip(u.astype(int), 0, width - 2)
+    j = np.clip(v.astype(int), 0, height - 2)
+    fu, fv = np.clip(u - i, 0.0, 1.0), np.clip(v - j, 0.0, 1.0)
+    corners = (picture[j, i], picture[j, i + 1], picture[j + 1, i], picture[j + 1, i + 1])
+    top = corners[0] + fu * (corners[1] - corners[0])
+    bottom = corners[2] + fu * (corners[3] - corners[2])
+    usable = inside & (np.minimum.reduce(corners) >= 0.0)
+    values = np.where(usable, top + fv * (bottom - top), -1.0)
+    return values.reshape(height, width).astype(np.float32)

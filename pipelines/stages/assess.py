@@ -1,0 +1,267 @@
+"""The assess stage: the delivered mesh and cloud, seen from cameras that nothing was made from.
+
+Reads the held-out photos with their masks, the cameras of `train`, `mesh.ply` and `pointcloud.ply`
+as they are delivered, and what `evaluate` found of floaters. Where training held nothing out,
+training views take the place of held-out ones, and the result says so. Writes `assets.json` and
+`images/<name>.jpg`: photo | mesh | where there is none. Nothing is rendered from the model, no GPU
+is used.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipelines.errors import ExportError
+from pipelines.exports.formats.ply import Ply, read_ply
+from pipelines.judging.asset_scores import DEFINITIONS, mean_scores, picture_of, score_view
+from pipelines.judging.asset_views import AssetView, MeshCaster, cloud_view, point_spacing
+from pipelines.judging.depth_scores import (
+    depth_agreement,
+    depth_scores,
+    fitted_scale,
+    read_depth_png,
+)
+from pipelines.judging.geometry_gate import Limits, geometry_warning
+from pipelines.nerf.data.images import ImageData, load_images
+from pipelines.nerf.judging.off_path import evenly
+from pipelines.nerf.space.cameras import Cameras, SceneTransform
+from pipelines.options import AssessOptions
+from pipelines.scene.cameras_file import CamerasFile, PosedImage
+from pipelines.scene.depth_maps_file import DepthMapsFile
+from pipelines.scene.trained_scene import nerf_cameras, nerf_errors_as
+from pipelines.stage import StageContext
+from pipelines.stages.evaluate import picture_name
+from pipelines.workspace import Workspace
+
+MILLIMETRE = 0.001
+DEPTH_UNIT_NOTE = "depth_unit_scale_factor"
+"""Key of the notes in `cameras.json`: world units per value of a depth picture."""
+NO_AGREED_DEPTH = "This job made no depth maps that views agree on."
+_AGREEMENT_VIEWS = 8
+
+
+@dataclass(frozen=True)
+class Views:
+    """What assets are compared with: N photos at the size asked for, and their cameras.
+
+    cameras: in `frame`, the world less its origin. held_out: whether training never saw them.
+    """
+
+    posed: list[PosedImage]
+    images: ImageData
+    cameras: Cameras
+    frame: SceneTransform
+    held_out: bool
+
+    def photo(self, index: int) -> NDArray[np.float32]:
+        """[H, W, 3] in [0, 1]."""
+        photo: NDArray[np.float32] = self.images.image(index).numpy()
+        return photo
+
+    def valid(self, index: int) -> NDArray[np.bool_] | None:
+        """[H, W], or None where all of it counts."""
+        mask = self.images.mask(index)
+        return None if mask is None else mask.numpy()
+
+
+def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
+    """Measure. The summary is the content of `assets.json`.
+
+    Raises ExportError `geometry_poor` where the options require surfaces that hold together.
+    """
+    (ctx.out / "images").mkdir(exist_ok=True)
+    views = load_views(ctx.workspace, options)
+    ctx.progress(0.1, "reading the mesh")
+    mesh = read_ply(ctx.workspace.stage("mesh") / "mesh.ply")
+    caster = _caster(mesh, views.frame)
+    seen = _look_at_mesh(caster, views, options, ctx)
+    agreement, no_agreement = _against_agreed_depth(caster, views.frame, ctx.workspace)
+    cloud = read_ply(ctx.workspace.stage("pointcloud") / "pointcloud.ply")
+    cloud_rows, spacing = _look_at_cloud(cloud, views, ctx)
+    mesh_means, floaters = mean_scores(seen.rows), _floaters(ctx.workspace)
+    warning = geometry_warning(
+        mesh_means["coverage"],
+        floaters,
+        Limits(options.min_coverage, options.max_depth_inconsistency),
+    )
+    depth, no_depth = _against_sensor(seen.views, views, ctx.workspace)
+    assets = {
+        "views": describe(views),
+        "mesh": mesh_means,
+        "cloud": {**mean_scores(cloud_rows), "median_spacing": spacing},
+        "depth_agreement": agreement,
+        "depth_agreement_reason": no_agreement,
+        "depth": depth,
+        "depth_reason": no_depth,
+        "depth_inconsistency": floaters,
+        "warnings": [] if warning is None else [warning],
+        "definitions": DEFINITIONS,
+        "per_view": [
+            {"file": image.file, "mesh": mesh_row, "cloud": cloud_row}
+            for image, mesh_row, cloud_row in zip(views.posed, seen.rows, cloud_rows, strict=True)
+        ],
+    }
+    (ctx.out / "assets.json").write_text(json.dumps(assets, indent=1), "utf-8")
+    if warning is not None:
+        ctx.logger.warning("%s %s", warning["message"], warning["hint"])
+        if options.require_geometry:
+            raise ExportError(
+                warning["message"],
+                code=warning["code"],
+                hint=warning["hint"],
+                details=warning["details"],
+            )
+    ctx.progress(1.0, "measured", 0.0)
+    return assets
+
+
+def load_views(workspace: Workspace, options: AssessOptions) -> Views:
+    """The held-out photos, evenly picked; training photos where none were held out."""
+    cameras = CamerasFile.load(workspace.stage("train") / "cameras.json")
+    held_out = [image for image in cameras.images if image.split == "test"]
+    pool = held_out or [image for image in cameras.images if image.split == "train"]
+    posed = [pool[index] for index in evenly(len(pool), options.num_views or len(pool))]
+    poses = np.asarray([image.world_from_camera for image in posed], np.float64)
+    frame = SceneTransform.fit(poses[:, :, 3], scale_poses=False)
+    root = workspace.images_root
+    with nerf_errors_as(ExportError):
+        images = load_images(
+            [root / image.file for image in posed],
+            options.long_side_px,
+            [None if image.mask is None else root / image.mask for image in posed],
+        )
+        lenses = [cameras.cameras[image.camera] for image in posed]
+        sized = nerf_cameras(lenses, poses, frame).resized(options.long_side_px)
+    return Views(posed, images, sized, frame, bool(held_out))
+
+
+def describe(views: Views) -> dict[str, Any]:
+    """What the assets were compared with, in words and numbers."""
+    width, height = views.cameras.size[0].tolist()
+    note = (
+        "Held-out photos, never trained on."
+        if views.held_out
+        else "Nothing was held out: photos that were trained on, evenly picked."
+    )
+    return {
+        "held_out": views.held_out,
+        "num_views": len(views.posed),
+        "width": width,
+        "height": height,
+        "note": note,
+    }
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """views, rows: of the mesh, one per photo."""
+
+    views: list[AssetView]
+    rows: list[dict[str, float | None]]
+
+
+def _caster(mesh: Ply, frame: SceneTransform) -> MeshCaster:
+    colors = None if mesh.colors is None else mesh.colors.astype(np.float32) / 255.0
+    return MeshCaster(frame.scene_from_world(mesh.points), mesh.faces, colors)
+
+
+def _look_at_mesh(
+    caster: MeshCaster, views: Views, options: AssessOptions, ctx: StageContext
+) -> _Seen:
+    shown = set(evenly(len(views.posed), options.num_pictures)) if options.num_pictures else set()
+    seen = _Seen([], [])
+    for index, image in enumerate(views.posed):
+        view, photo = caster.view(views.cameras, index), views.photo(index)
+        seen.views.append(view)
+        seen.rows.append(score_view(view, photo, views.valid(index)))
+        if index in shown:
+            path = ctx.out / "images" / f"{picture_name(image.file)}.jpg"
+            Image.fromarray(picture_of(view, photo)).save(path, quality=90)
+        ctx.progress(0.15 + 0.35 * (index + 1) / len(views.posed), "looking at the mesh")
+    return seen
+
+
+def _look_at_cloud(
+    cloud: Ply, views: Views, ctx: StageContext
+) -> tuple[list[dict[str, float | None]], float]:
+    """The rows of the cloud, drawn with its own spacing as radius, and the median spacing."""
+    points = views.frame.scene_from_world(cloud.points)
+    grey = np.full((len(points), 3), 128, np.uint8)
+    colors = (grey if cloud.colors is None else cloud.colors).astype(np.float32) / 255.0
+    ctx.progress(0.5, "measuring the cloud's spacing")
+    spacing = point_spacing(points)
+    rows = []
+    for index in range(len(views.posed)):
+        view = cloud_view(points, colors, spacing, views.cameras, index)
+        rows.append(score_view(view, views.photo(index), views.valid(index)))
+        ctx.progress(0.6 + 0.35 * (index + 1) / len(views.posed), "looking at the cloud")
+    return rows, round(float(np.median(spacing)), 6)
+
+
+def _floaters(workspace: Workspace) -> float | None:
+    """The depth inconsistency that `evaluate` measured, if it did."""
+    metrics = json.loads((workspace.stage("evaluate") / "metrics.json").read_text("utf-8"))
+    found = (metrics.get("floaters") or {}).get("depth_inconsistency")
+    return None if found is None else float(found)
+
+
+def _against_agreed_depth(
+    caster: MeshCaster, frame: SceneTransform, workspace: Workspace
+) -> tuple[dict[str, Any] | None, str | None]:
+    """The mesh against the maps of the stage `depth`, or why it was not compared."""
+    maps = DepthMapsFile(workspace.stage("depth")) if workspace.is_complete("depth") else None
+    if maps is None or len(maps) == 0:
+        return None, NO_AGREED_DEPTH
+    cameras = CamerasFile.load(workspace.stage("train") / "cameras.json")
+    poses = {image.file: image.world_from_camera for image in cameras.images}
+    found, agreed = [], []
+    for index in evenly(len(maps), _AGREEMENT_VIEWS):
+        item = maps.images[index]
+        pose = np.asarray(poses[item.file], np.float64)
+        # As they come, rays reach one unit along the camera's axis: distance / length is z-depth.
+        rays = item.lens.directions().reshape(-1, 3)
+        lengths = np.linalg.norm(rays, axis=1)
+        eyes = np.broadcast_to(frame.scene_from_world(pose[:, 3]), rays.shape)
+        turned = (rays / lengths[:, None]) @ pose[:, :3].T
+        shape = (item.lens.height, item.lens.width)
+        view = caster.along(eyes, turned, shape)
+        found.append(view.distance / lengths.reshape(shape))
+        agreed.append(maps.read(index).z)
+    return depth_agreement(found, agreed), None
+
+
+def _against_sensor(
+    seen: list[AssetView], views: Views, workspace: Workspace
+) -> tuple[dict[str, Any] | None, str | None]:
+    """The mesh's depth against the capture's own, or why it was not compared.
+
+    Where poses came with the capture, its unit is that of its depth; where they were found from
+    pictures, one factor for all views brings the mesh to the sensor's unit, and is reported.
+    """
+    rows = [row for row, image in enumerate(views.posed) if image.depth is not None]
+    if not rows:
+        return None, "The capture holds no depth."
+    notes = CamerasFile.load(workspace.stage("train") / "cameras.json").notes
+    unit = float(notes.get(DEPTH_UNIT_NOTE, MILLIMETRE))
+    found, truth = [], []
+    for row in rows:
+        shape = (seen[row].hit.shape[0], seen[row].hit.shape[1])
+        path = workspace.images_root / str(views.posed[row].depth)
+        try:
+            depth = read_depth_png(path, unit, shape)
+        except ValueError as error:
+            return None, f"The capture's depth was not compared: {error}"
+        valid = views.valid(row)
+        truth.append(depth if valid is None else np.where(valid, depth, np.float32(0.0)))
+        found.append(seen[row].z_depth(views.cameras, row))
+    scale = 1.0
+    if workspace.is_complete("poses"):
+        scale = fitted_scale(found, truth) or 1.0
+        found = [scale * values for values in found]
+    return {**depth_scores(found, truth), "scale": round(scale, 6)}, None

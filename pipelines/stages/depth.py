@@ -1,0 +1,138 @@
+"""The depth stage: where surfaces are, from the pictures alone, before anything is trained.
+
+Reads `cameras.json` of `poses` or `ingest`, the images beside it, and the points of structure from
+motion where there are any. Writes a depth map for each image that will be trained on, agreed upon
+by its neighbours (`maps.json`, `maps/`), and `depth.jpg` to look at. Held-out images take no part:
+what they judge must not be made from them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipelines.errors import TrainingError
+from pipelines.exports.formats.ply import read_ply
+from pipelines.nerf.data.images import split_indices
+from pipelines.nerf.judging.off_path import evenly
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.options.train import SplitConfig, config_from_dict
+from pipelines.nerf.stereo.maps import DepthMap, find_depth_maps
+from pipelines.nerf.stereo.views import StereoView
+from pipelines.option_models import StageOptions
+from pipelines.scene.cameras_file import CamerasFile, PosedImage
+from pipelines.scene.depth_maps_file import DepthMapsWriter
+from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.natural_order import natural_key
+from pipelines.scene.stereo_views import stereo_view
+from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
+from pipelines.stage import StageContext
+
+_LOAD_SHARE, _STEREO_SHARE = 0.05, 0.95
+_PICTURE_VIEWS = 6
+_NEAR_TO_FAR = np.array(
+    [[252, 231, 155], [245, 150, 85], [190, 70, 110], [90, 40, 120], [20, 20, 60]], np.float64
+)
+_UNKNOWN = (60, 60, 60)
+
+
+def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
+    """Find the maps. Raises TrainingError where nothing is left to learn from."""
+    use_all_cores()
+    values = options.model_dump()
+    source = values.pop("source")
+    split: SplitConfig = config_from_dict(SplitConfig, values.pop("held_out"))
+    config: StereoConfig = config_from_dict(StereoConfig, values)
+    writer = DepthMapsWriter(ctx.out)
+    if source == "off":
+        writer.close()
+        return {"source": source, "num_maps": 0}
+    started = time.monotonic()
+    capture, images = training_images(ctx, split)
+    lenses = [capture.cameras[image.camera] for image in images]
+    views = []
+    for index, (image, lens) in enumerate(zip(images, lenses, strict=True)):
+        views.append(stereo_view(ctx.workspace.images_root, image, lens, config.long_side_px))
+        ctx.progress(_LOAD_SHARE * (index + 1) / len(images), "loading images")
+
+    def on_progress(fraction: float, message: str) -> None:
+        share = _LOAD_SHARE + (_STEREO_SHARE - _LOAD_SHARE) * fraction
+        spent = time.monotonic() - started
+        ctx.progress(share, message, spent * (1.0 - share) / share if share > 0.1 else None)
+
+    maps = find_depth_maps(views, config, _known_points(ctx), on_progress)
+    for image, view, found in zip(images, views, maps, strict=True):
+        ctx.check_cancelled()
+        writer.append(image.file, _pinhole(view), found)
+    writer.close()
+    _save_picture(ctx.out / "depth.jpg", views, maps)
+    summary = {"source": source, "num_maps": len(maps), **_described(maps)}
+    (ctx.out / "report.json").write_text(json.dumps(summary, indent=1), "utf-8")
+    return summary
+
+
+def training_images(ctx: StageContext, split: SplitConfig) -> tuple[CamerasFile, list[PosedImage]]:
+    """The capture, and the images of it that training will learn from, in its order."""
+    capture = CamerasFile.load(ctx.workspace.posed_cameras)
+    ordered = sorted(capture.images, key=lambda image: natural_key(image.file))
+    with nerf_errors_as(TrainingError):
+        trained, _ = split_indices(len(ordered), split)
+    return capture, [ordered[index] for index in trained]
+
+
+def _known_points(ctx: StageContext) -> NDArray[np.float64] | None:
+    path = ctx.workspace.stage("poses") / "points.ply"
+    if not ctx.workspace.is_complete("poses") or not path.is_file():
+        return None
+    return np.asarray(read_ply(path).points, np.float64)
+
+
+def _pinhole(view: StereoView) -> Pinhole:
+    height, width = view.picture.shape
+    return Pinhole(width, height, *view.lens)
+
+
+def _described(maps: list[DepthMap]) -> dict[str, Any]:
+    """How much of the pictures has a depth, and how many neighbours agree with it."""
+    shares = [float((found.z > 0).mean()) for found in maps]
+    votes = [float(found.votes[found.z > 0].mean()) for found in maps if (found.z > 0).any()]
+    return {
+        "known_share": round(float(np.mean(shares)), 4),
+        "least_known_share": round(float(np.min(shares)), 4),
+        "mean_votes": round(float(np.mean(votes)), 2) if votes else None,
+    }
+
+
+def _save_picture(path: Path, views: list[StereoView], maps: list[DepthMap]) -> None:
+    """Some of the pictures, their maps below: near is bright, far is dark, grey is unknown."""
+    picked = evenly(len(views), _PICTURE_VIEWS)
+    height = max(views[index].picture.shape[0] for index in picked)
+    columns = []
+    for index in picked:
+        grey = np.clip(views[index].picture, 0.0, 1.0)[..., None] * np.ones(3) * 255.0
+        both = (np.rint(grey).astype(np.uint8), _colored(maps[index].z))
+        padded = [np.pad(item, ((0, height - len(item)), (0, 4), (0, 0))) for item in both]
+        columns.append(np.concatenate(padded))
+    Image.fromarray(np.concatenate(columns, axis=1)).save(path, quality=88)
+
+
+def _colored(z: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """[H, W, 3] by the logarithm of the depth, over the map's own range."""
+    known = z > 0
+    colors = np.tile(np.array(_UNKNOWN, np.uint8), (*z.shape, 1))
+    if not known.any():
+        return colors
+    low, high = np.percentile(z[known], (2.0, 98.0))
+    span = max(math.log(high / low), 1e-6)
+    place = np.clip(np.log(z[known] / low) / span, 0.0, 1.0) * (len(_NEAR_TO_FAR) - 1)
+    steps = np.arange(len(_NEAR_TO_FAR))
+    channels = [np.interp(place, steps, _NEAR_TO_FAR[:, channel]) for channel in range(3)]
+    colors[known] = np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
+    return colors

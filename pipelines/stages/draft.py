@@ -1,0 +1,112 @@
+"""The draft stage: a mesh from the depth maps alone, long before anything is trained.
+
+Reads the maps of `depth`, the posed cameras and their images. Writes `draft.glb`, the maps fused
+and cleaned as the final mesh is, with the photos' colours, and `draft.jpg`, the draft seen from a
+camera of the capture. Where the maps show no surface it writes nothing and says so: the job goes
+on, its mesh comes from training.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipelines.exports.formats import glb
+from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.options import reach_of
+from pipelines.exports.surface.shells import find_shells, fuse_shells
+from pipelines.judging.asset_views import MeshCaster
+from pipelines.nerf.judging.off_path import evenly
+from pipelines.options import DraftOptions
+from pipelines.scene.bounds import bounds_of_views
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.depth_maps_file import DepthMapsFile
+from pipelines.scene.depth_views import DepthView, Floats, Pinhole, ViewStore
+from pipelines.scene.stereo_views import undistorted_picture
+from pipelines.stage import StageContext
+
+_PICTURE_LONG_SIDE = 640
+_LOAD_SHARE, _FUSE_SHARE = 0.4, 0.9
+_BACKGROUND = 128
+_NUM_PROBES = 16
+
+
+def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
+    """Make the draft."""
+    maps = DepthMapsFile(ctx.workspace.stage("depth"))
+    if len(maps) == 0:
+        return _nothing(ctx, "there are no depth maps")
+    cameras = CamerasFile.load(ctx.workspace.posed_cameras)
+    poses = np.asarray([image.world_from_camera for image in cameras.images], np.float64)
+    with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
+        views = _views(maps, cameras, Path(folder), options, ctx)
+        probes = [views[index] for index in evenly(len(views), _NUM_PROBES)]
+        shells = find_shells(
+            lambda distance: bounds_of_views(probes, poses, distance),
+            options.max_distance,
+            reach_of(options),
+            options.resolution,
+        )
+        if not shells:
+            return _nothing(ctx, "no depth map shows a surface near what the cameras look at")
+        share = _FUSE_SHARE - _LOAD_SHARE
+        mesh = fuse_shells(
+            views,
+            shells,
+            options.max_faces,
+            lambda done: ctx.progress(_LOAD_SHARE + share * done, "fusing depth", None),
+        )
+    if len(mesh.faces) == 0:
+        return _nothing(ctx, "no two depth maps agree on a surface")
+    glb.write_mesh(ctx.out / "draft.glb", mesh)
+    _save_picture(ctx.out / "draft.jpg", mesh, probes[len(probes) // 2], shells[0].bounds.focus)
+    return {
+        "num_faces": len(mesh.faces),
+        "num_views": len(maps),
+        "voxel": round(shells[0].voxel, 9),
+        "bounds": shells[0].bounds.as_dict(),
+    }
+
+
+def _nothing(ctx: StageContext, why: str) -> dict[str, Any]:
+    ctx.logger.warning("There is no draft: %s.", why)
+    return {"num_faces": 0, "why": why}
+
+
+def _views(
+    maps: DepthMapsFile,
+    cameras: CamerasFile,
+    folder: Path,
+    options: DraftOptions,
+    ctx: StageContext,
+) -> ViewStore:
+    """The maps with the photos' colours, as depth views on disk."""
+    named = {image.file: image for image in cameras.images}
+    store = ViewStore(folder)
+    picked = evenly(len(maps), options.num_views or len(maps))
+    for done, index in enumerate(picked, start=1):
+        image, lens = named[maps.images[index].file], maps.images[index].lens
+        picture = undistorted_picture(
+            ctx.workspace.images_root, image, cameras.cameras[image.camera], lens
+        )
+        pose = np.asarray(image.world_from_camera, np.float64)
+        store.append(DepthView(lens, pose, picture, maps.read(index).z))
+        ctx.progress(_LOAD_SHARE * done / len(picked), "loading images")
+    return store
+
+
+def _save_picture(path: Path, mesh: TriangleMesh, view: DepthView, origin: Floats) -> None:
+    """The mesh from a view's camera, on grey."""
+    lens = Pinhole.of(view.lens.intrinsics(), _PICTURE_LONG_SIDE)
+    rays = lens.directions().reshape(-1, 3) @ view.world_from_camera[:, :3].T
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    eye = np.broadcast_to(view.world_from_camera[:, 3] - origin, rays.shape)
+    seen = MeshCaster(mesh.vertices - origin, mesh.faces, mesh.colors).along(
+        eye, rays, (lens.height, lens.width)
+    )
+    colors = np.where(seen.hit[..., None], np.rint(255.0 * seen.color), _BACKGROUND)
+    Image.fromarray(colors.astype(np.uint8)).save(path, quality=88)

@@ -1,0 +1,217 @@
+"""Other lens models fitted to a reconstruction that is there, and judged by what they did not see.
+
+`LensTrials` sets some observations of many tracks aside, adjusts poses, points and lens to the
+others, and projects the points into the images again where the observations were left out. Nothing
+is matched or placed anew: a trial is one bundle adjustment of a part of the tracks. What the errors
+mean is left to `pipelines.sfm.intrinsics`.
+
+Symbols: H held-out observations. Lenses are named as COLMAP names them; a lens is given per camera,
+by COLMAP's camera id.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from pipelines.tools.colmap_results import LENS_PARAMETERS, SparseModel, sparse_model
+
+Floats = npt.NDArray[np.float64]
+Run = Callable[[str, Callable[[Any], Any]], Any]
+"""`(what, call)`: runs `call(token)` where it can be cancelled, and returns what it returns."""
+
+MIN_TRACK = 4
+"""Observations of a track of which some are held out, one in so many: at least three stay, of which
+two place the point and the third says where that is wrong."""
+ENOUGH_OBSERVATIONS = 12_000
+ENOUGH_PER_IMAGE = 200
+"""Tracks are taken until they have so many observations, whichever is more: enough to fix every
+pose and to tell lenses apart, and a fraction of what mapping adjusts many times (docs/poses.md)."""
+_ITERATIONS, _ROUNDS = 10, 5
+"""A round of iterations cannot be interrupted; between two of them a cancel is noticed."""
+_TOLERANCE = 1e-6
+"""Relative change of the cost at which an adjustment ends; COLMAP's own goes on for 2 to 3 times as
+many rounds, for errors that are equal in four digits."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A trial's result.
+
+    lenses, focal_xy_px: by camera id. errors_px: [H], infinite behind the camera. reconstruction:
+    pycolmap's, of the tracks that were fitted.
+    """
+
+    lenses: dict[int, str]
+    focal_xy_px: dict[int, tuple[float, float]]
+    errors_px: Floats
+    reconstruction: Any
+
+    @property
+    def focal_px(self) -> dict[int, float]:
+        """The mean of both axes, by camera id."""
+        return {camera: (x + y) / 2 for camera, (x, y) in self.focal_xy_px.items()}
+
+
+class LensTrials:
+    """Trials on one model, all with the same observations held out.
+
+    folder: where COLMAP wrote the model. cameras: lens by camera id, as it was mapped. num_views:
+    images by camera id. image_of, camera_of: [H] ids of the held-out observations.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        refine_principal_point: bool,
+        num_threads: int,
+        seed: int,
+        run: Run,
+    ) -> None:
+        self._run = run
+        self._principal = refine_principal_point
+        self._num_threads = num_threads
+        self._folder = folder
+        self._whole = pycolmap.Reconstruction(folder)
+        images = [self._whole.image(i) for i in self._whole.reg_image_ids()]
+        used = sorted({image.camera_id for image in images})
+        self.cameras = {i: str(self._whole.camera(i).model.name) for i in used}
+        self.num_views = {i: sum(image.camera_id == i for image in images) for i in used}
+        self._part = copy.deepcopy(self._whole)
+        held = self._hold_out(np.random.default_rng(seed), len(images))
+        self._held_point = [point for point, _, _ in held]
+        self._held_xy = np.array([xy for _, _, xy in held], np.float64).reshape(-1, 2)
+        self.image_of = np.array([image for _, image, _ in held], np.int64)
+        self.camera_of = np.array(
+            [self._whole.image(int(image)).camera_id for image in self.image_of], np.int64
+        )
+
+    def _hold_out(
+        self, random: np.random.Generator, num_images: int
+    ) -> list[tuple[int, int, Floats]]:
+        """Keep some tracks in the part, without observations that are returned: (point, image,
+        pixel)."""
+        part = self._part
+        lengths = {i: point.track.length() for i, point in part.points3D.items()}
+        long = sorted(i for i, length in lengths.items() if length >= MIN_TRACK)
+        order = random.permutation(np.array(long, np.int64))
+        counted = np.cumsum([lengths[int(i)] for i in order])
+        enough = max(ENOUGH_OBSERVATIONS, ENOUGH_PER_IMAGE * num_images)
+        kept = set(order[: int(np.searchsorted(counted, enough)) + 1].tolist())
+        for point in set(part.point3D_ids()) - kept:
+            part.delete_point3D(point)
+        held = []
+        for point in sorted(kept):
+            elements = [
+                (element.image_id, element.point2D_idx)
+                for element in part.point3D(point).track.elements
+            ]
+            for chosen in random.permutation(len(elements))[: len(elements) // MIN_TRACK]:
+                image, index = elements[int(chosen)]
+                held.append((point, image, np.array(part.image(image).points2D[index].xy)))
+                part.delete_observation(image, index)
+        return held
+
+    def fit(
+        self,
+        lenses: Mapping[int, str],
+        *,
+        start: Fit | None = None,
+        focal_scale: float | None = None,
+    ) -> Fit:
+        """Adjust the tracks with these lenses, from what mapping found or from another fit.
+
+        focal_scale: multiply the focal lengths and hold them; None fits them.
+        """
+        fitted = copy.deepcopy(self._part if start is None else start.reconstruction)
+        for camera_id, lens in lenses.items():
+            camera = fitted.camera(camera_id)
+            change_lens(camera, lens)
+            if focal_scale is not None:
+                params = np.array(camera.params)
+                params[list(camera.focal_length_idxs())] *= focal_scale
+                camera.params = params
+        self._adjust(fitted, refine_focal=focal_scale is None)
+        cameras = {i: fitted.camera(i) for i in lenses}
+        return Fit(
+            lenses=dict(lenses),
+            focal_xy_px={
+                i: (float(camera.focal_length_x), float(camera.focal_length_y))
+                for i, camera in cameras.items()
+            },
+            errors_px=self._errors(fitted),
+            reconstruction=fitted,
+        )
+
+    def adopt(self, lenses: Mapping[int, str]) -> SparseModel:
+        """The whole model, adjusted once more with these lenses."""
+        whole = copy.deepcopy(self._whole)
+        for camera_id, lens in lenses.items():
+            change_lens(whole.camera(camera_id), lens)
+        self._adjust(whole, refine_focal=True)
+        whole.update_point_3d_errors()
+        return sparse_model(whole, self._folder)
+
+    def _adjust(self, reconstruction: Any, *, refine_focal: bool) -> None:
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = False
+        options.refine_focal_length = refine_focal
+        options.refine_principal_point = self._principal
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+        options.ceres.solver_options.num_threads = self._num_threads
+        options.ceres.solver_options.max_num_iterations = _ITERATIONS
+        options.ceres.solver_options.function_tolerance = _TOLERANCE
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in reconstruction.reg_image_ids():
+            config.add_image(image_id)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        for _ in range(_ROUNDS):
+            adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+            summary = self._run("fitting the lens", functools.partial(_solve, adjuster))
+            if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
+                break
+
+    def _errors(self, fitted: Any) -> Floats:
+        """Distance of each held-out observation from where its point is seen now, [H] pixels."""
+        errors = np.full(len(self._held_point), np.inf)
+        for image_id in np.unique(self.image_of).tolist():
+            here = np.flatnonzero(self.image_of == image_id)
+            image = fitted.image(image_id)
+            pose = image.cam_from_world().matrix()
+            there = [k for k in here if fitted.exists_point3D(self._held_point[k])]
+            points = np.array([fitted.point3D(self._held_point[k]).xyz for k in there])
+            local = points.reshape(-1, 3) @ pose[:, :3].T + pose[:, 3]
+            front = local[:, 2] > 0
+            seen = np.array(there, np.int64)[front]
+            pixels = np.array(fitted.camera(image.camera_id).img_from_cam(local[front]))
+            errors[seen] = np.linalg.norm(pixels.reshape(-1, 2) - self._held_xy[seen], axis=1)
+        errors[~np.isfinite(errors)] = np.inf
+        return errors
+
+
+def _solve(adjuster: Any, token: Any) -> Any:
+    """One round; it cannot be cancelled by the token."""
+    del token
+    return adjuster.solve()
+
+
+def change_lens(camera: Any, lens: str) -> None:
+    """Make a pycolmap camera one of another model, with what both have in common; the rest is 0.
+
+    Two focal lengths become their mean where the new model has one.
+    """
+    names, given = LENS_PARAMETERS[lens], camera.params
+    values = dict(zip(LENS_PARAMETERS[camera.model.name], map(float, given), strict=True))
+    focal = float(camera.mean_focal_length())
+    values = {"f": focal, "fl_x": focal, "fl_y": focal} | values
+    camera.model = getattr(pycolmap.CameraModelId, lens)
+    camera.params = np.array([values.get(name, 0.0) for name in names])

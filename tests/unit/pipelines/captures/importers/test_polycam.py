@@ -1,0 +1,79 @@
+"""Polycam raw exports: metric, +Z up, the corrected poses, the sharp frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.options import IngestOptions
+from tests.unit.pipelines.captures.archives import polycam_files
+from tests.unit.pipelines.captures.ingesting import cameras, code_of, ingest, warning_with
+
+
+@pytest.mark.parametrize("corrected", [True, False])
+def test_polycam_poses_become_metric_and_z_up(tmp_path: Path, corrected: bool) -> None:
+    summary, ctx = ingest(tmp_path, polycam_files(corrected=corrected))
+    file = cameras(ctx)
+    assert (summary["kind"], summary["corrected"], file.metric) == ("polycam", corrected, True)
+    pose_of_third = np.array(file.images[2].world_from_camera)
+    # ARKit (2, 0.5, -2): 0.5 m high. The camera's up (+Y) is the world's up (+Z).
+    np.testing.assert_allclose(pose_of_third[:, 3], [-2.0, 2.0, 0.5])
+    np.testing.assert_allclose(pose_of_third[:, 1], [0.0, 0.0, 1.0])
+    assert np.linalg.det(pose_of_third[:, :3]) == pytest.approx(1.0)
+    assert file.images[2].timestamp_s == pytest.approx(2.0)
+    drifts = any("drift" in warning for warning in summary["warnings"])
+    assert drifts is not corrected
+
+
+def test_polycam_prefers_corrected_poses(tmp_path: Path) -> None:
+    raw = polycam_files(6, corrected=False)
+    summary, ctx = ingest(tmp_path, raw | polycam_files(4, corrected=True))
+    assert (summary["corrected"], len(cameras(ctx).images)) == (True, 4)
+
+
+def test_polycam_drops_blurred_frames_if_enough_remain(tmp_path: Path) -> None:
+    scores = [10.0 if n % 5 == 0 else 90.0 for n in range(30)]
+    summary, _ = ingest(tmp_path, polycam_files(30, blur_scores=scores))
+    assert summary["num_posed"] == 24
+    assert warning_with(summary, "6 pictures", "blurred")
+
+
+def test_polycam_keeps_blurred_frames_if_few_would_remain(tmp_path: Path) -> None:
+    summary, _ = ingest(tmp_path, polycam_files(8, blur_scores=[10.0] * 8))
+    assert summary["num_posed"] == 8
+    assert any("blurred" in warning for warning in summary["warnings"])
+
+
+def test_polycam_without_cameras_misses_its_poses(tmp_path: Path) -> None:
+    files = {name: data for name, data in polycam_files().items() if "cameras" not in name}
+    assert code_of(tmp_path, files) == "poses_missing"
+
+
+@pytest.mark.parametrize("value", ['{"fx": 1}', "[]", "{"])
+def test_polycam_with_a_malformed_camera_is_refused(tmp_path: Path, value: str) -> None:
+    files = polycam_files()
+    files["keyframes/corrected_cameras/1500000.json"] = value
+    assert code_of(tmp_path, files) == "poses_malformed"
+
+
+def test_long_export_is_thinned_evenly(tmp_path: Path) -> None:
+    summary, ctx = ingest(tmp_path, polycam_files(13), IngestOptions(max_posed_images=4))
+    assert summary["num_frames"] == 13
+    assert [image.world_from_camera[1][3] for image in cameras(ctx).images] == [0, 4, 8, 12]
+    assert warning_with(summary, "9 pictures", "at even distances")
+
+
+def test_polycam_depth_is_not_read_and_told(tmp_path: Path) -> None:
+    files = polycam_files(4) | {f"keyframes/depth/{n}.png": b"" for n in range(5)}
+    summary, _ = ingest(tmp_path, files)
+    assert "5 files in keyframes/depth/" in warning_with(summary, "phone's depth")
+
+
+def test_polycam_with_one_malformed_camera_in_ten_leaves_it_out(tmp_path: Path) -> None:
+    files = polycam_files(10)
+    files["keyframes/corrected_cameras/1500000.json"] = "{"
+    summary, ctx = ingest(tmp_path, files)
+    assert len(cameras(ctx).images) == 9
+    assert "1500000.json" in warning_with(summary, "Left out")

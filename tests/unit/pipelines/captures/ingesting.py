@@ -1,0 +1,64 @@
+"""Small archives through the stage `ingest`, as every importer's tests want it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.errors import CaptureError
+from pipelines.options import IngestOptions
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.stage import StageContext
+from pipelines.stages.ingest import run
+from tests.unit.pipelines.captures.archives import context, write_zip
+
+Files = dict[str, bytes | str]
+
+
+def ingest(
+    tmp_path: Path, files: Mapping[str, bytes | str], options: IngestOptions | None = None
+) -> tuple[dict[str, Any], StageContext]:
+    """The stage's summary, and its context with what it wrote in `out`."""
+    ctx = context(tmp_path)
+    ctx.workspace.capture_file.parent.mkdir(parents=True)
+    write_zip(ctx.workspace.capture_file, files)
+    return run(options or IngestOptions(), ctx), ctx
+
+
+def failure(
+    tmp_path: Path, files: Mapping[str, bytes | str], options: IngestOptions | None = None
+) -> CaptureError:
+    """The error that the stage refuses the archive with."""
+    with pytest.raises(CaptureError) as caught:
+        ingest(tmp_path, files, options)
+    assert caught.value.message
+    assert str(tmp_path) not in caught.value.message + caught.value.hint
+    return caught.value
+
+
+def code_of(
+    tmp_path: Path, files: Mapping[str, bytes | str], options: IngestOptions | None = None
+) -> str:
+    """The code of that error."""
+    return failure(tmp_path, files, options).code
+
+
+def cameras(ctx: StageContext) -> CamerasFile:
+    """The poses that the stage wrote."""
+    return CamerasFile.load(ctx.out / "cameras.json")
+
+
+def sources(ctx: StageContext) -> list[str]:
+    """Names in the archive of the pictures that were taken, in order."""
+    record = json.loads((ctx.out / "capture.json").read_text())
+    return [image["source"] for image in record["images"]]
+
+
+def warning_with(summary: Mapping[str, Any], *words: str) -> str:
+    """The one warning that holds all the words."""
+    (found,) = [text for text in summary["warnings"] if all(word in text for word in words)]
+    return str(found)

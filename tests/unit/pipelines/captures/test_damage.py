@@ -1,0 +1,181 @@
+"""Damaged uploads of every kind: each is read, or refused with a code and a hint. Nothing else.
+
+The damage is random bytes from fixed seeds, where it hurts most: the directory of an archive, the
+numbers of a JSON file, the headers of pictures and videos.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from pipelines.captures.sniff import sniff
+from pipelines.errors import CaptureError, PipelineError, ToolError
+from pipelines.options import IngestOptions
+from pipelines.stages.ingest import run
+from tests.unit.pipelines.captures.archives import (
+    context,
+    nerfstudio_files,
+    picture,
+    polycam_files,
+    record3d_files,
+    write_zip,
+)
+from tests.unit.pipelines.captures.importers.test_blender import blender_files
+from tests.unit.pipelines.captures.ingesting import Files
+from tests.unit.pipelines.tools.clips import make_clip
+
+OPTIONS = IngestOptions(max_pixels=1_000_000, max_unpacked_bytes=50 << 20)
+
+
+def outcome(folder: Path, data: bytes, sniffed_only: bool = False) -> str:
+    """The kind that an upload is read as, or the code that it is refused with."""
+    ctx = context(folder)
+    path = ctx.workspace.capture_file
+    path.parent.mkdir(parents=True)
+    path.write_bytes(data)
+    try:
+        kind = sniff(path, "upload").kind
+        return kind if sniffed_only else str(run(OPTIONS, ctx)["kind"])
+    except PipelineError as caught:
+        error = caught
+    assert isinstance(error, CaptureError | ToolError), error
+    assert error.code
+    assert error.hint
+    assert str(folder) not in error.message + error.hint
+    return error.code
+
+
+def mutations(data: bytes, count: int, seed: int, start: int = 0) -> Iterator[bytes]:
+    """Copies of the bytes with a few of them changed from `start` on, some also cut off."""
+    rng = random.Random(seed)
+    for _ in range(count):
+        changed = bytearray(data)
+        for _ in range(rng.randint(1, 5)):
+            place = rng.randrange(start, len(changed))
+            changed[place] = rng.choice([0, 0x7F, 0x80, 0xFF, rng.randrange(256)])
+        if rng.random() < 0.1:
+            del changed[rng.randrange(max(start, 8), len(changed)) :]
+        yield bytes(changed)
+
+
+def zipped(tmp_path: Path, files: Files, method: int = 8) -> bytes:
+    return write_zip(tmp_path / "made.zip", files, method).read_bytes()
+
+
+@pytest.mark.parametrize("method", [0, 8])
+def test_archives_whose_directory_is_damaged(tmp_path: Path, method: int) -> None:
+    data = zipped(tmp_path, nerfstudio_files(4), method)
+    directory = data.index(b"PK\x01\x02")
+    found = Counter(
+        outcome(tmp_path / str(n), changed, sniffed_only=True)
+        for n, changed in enumerate(mutations(data, 150, method, directory))
+    )
+    assert found["archive_damaged"] > 50
+    assert found["nerfstudio"] > 5
+
+
+def test_archives_damaged_anywhere(tmp_path: Path) -> None:
+    data = zipped(tmp_path, nerfstudio_files(4))
+    found = Counter(
+        outcome(tmp_path / str(n), changed) for n, changed in enumerate(mutations(data, 60, 3))
+    )
+    assert found["archive_damaged"] > 10
+
+
+@pytest.mark.parametrize("field", [16, 20, 24, 42])
+@pytest.mark.parametrize("value", [0, 0x7FFFFFFF, 0xFFFFFFFE, 0xFFFFFFFF])
+def test_directory_entry_with_an_absurd_number(tmp_path: Path, field: int, value: int) -> None:
+    """CRC, packed size, size and offset of the first entry."""
+    data = bytearray(zipped(tmp_path, nerfstudio_files(4)))
+    struct.pack_into("<I", data, data.index(b"PK\x01\x02") + field, value)
+    assert outcome(tmp_path / "job", bytes(data)) in (
+        "archive_damaged",
+        "archive_bomb",
+        "nerfstudio",
+    )
+
+
+@pytest.mark.parametrize("field", [8, 10, 12, 16])
+@pytest.mark.parametrize("more", [1, 100, 100_000, 0x7FFF0000])
+def test_end_record_with_a_wrong_number(tmp_path: Path, field: int, more: int) -> None:
+    """Two counts of entries, the directory's size and offset: entries lie before the file then."""
+    data = bytearray(zipped(tmp_path, nerfstudio_files(4)))
+    place = data.index(b"PK\x05\x06") + field
+    form = "<H" if field < 12 else "<I"
+    (value,) = struct.unpack_from(form, data, place)
+    struct.pack_into(form, data, place, (value + more) % (1 << 8 * struct.calcsize(form)))
+    assert outcome(tmp_path / "job", bytes(data)) in (
+        "archive_damaged",
+        "archive_bomb",
+        "nerfstudio",
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (nerfstudio_files, "transforms.json"),
+        (lambda: blender_files(train=4), "transforms_train.json"),
+        (record3d_files, "EXR_RGBD/metadata.json"),
+        (polycam_files, "keyframes/corrected_cameras/1500000.json"),
+    ],
+)
+def test_damaged_json(tmp_path: Path, make: Callable[[], Files], name: str) -> None:
+    files = make()
+    text = str(files[name])
+    rng = random.Random(name)
+    for n in range(40):
+        where = rng.randrange(len(text))
+        piece = rng.choice(
+            ['"', "[", "]", "{}", "null", "-", "1e999", "NaN", ",", "[[1]]", ":", ""]
+        )
+        changed = text[:where] + piece + text[where + rng.randint(0, 12) :]
+        data = zipped(tmp_path, files | {name: changed}, 0)
+        assert outcome(tmp_path / str(n), data)
+
+
+@pytest.mark.parametrize("value", ["null", "[]", "{}", '"x"', "true", "1e400", "[[[1]]]", "-1"])
+def test_json_with_every_value_of_another_type(tmp_path: Path, value: str) -> None:
+    """Each key of each format in turn."""
+    for make, name in (
+        (nerfstudio_files, "transforms.json"),
+        (record3d_files, "EXR_RGBD/metadata.json"),
+    ):
+        files: Files = make()
+        text = str(files[name])
+        extra = '"camera_model": 0, "distortion_params": 0, "applied_transform": 0, "k1": 0, '
+        text = "{" + extra + text[1:]
+        keys = [part.split('"')[-1] for part in text.split('": ')[:-1]]
+        for n, key in enumerate(dict.fromkeys(keys)):
+            begin = text.index(f'"{key}": ')
+            changed = text[:begin] + f'"{key}": {value}, "was_' + text[begin + 1 :]
+            data = zipped(tmp_path, files | {name: changed}, 0)
+            assert outcome(tmp_path / f"{make.__name__}{n}", data)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def test_damaged_pictures(tmp_path: Path, kind: str) -> None:
+    """One of twelve photos is damaged: it is left out, or shows what is left of it."""
+    files: Files = {f"{n}.x": picture(seed=n, kind=kind) for n in range(12)}
+    victim = picture(seed=5, kind=kind)
+    found = Counter(
+        outcome(tmp_path / str(n), zipped(tmp_path, files | {"5.x": changed}, 0))
+        for n, changed in enumerate(mutations(victim[:700], 25, 4))
+    )
+    found += Counter(
+        outcome(tmp_path / f"whole{n}", zipped(tmp_path, files | {"5.x": changed}, 0))
+        for n, changed in enumerate(mutations(victim, 15, 5))
+    )
+    assert set(found) == {"images"}
+
+
+def test_damaged_videos(tmp_path: Path) -> None:
+    data = make_clip(tmp_path / "a.mp4", "testsrc2=s=160x90:r=10:d=2").read_bytes()
+    for n, changed in enumerate(mutations(data, 8, 6, data.index(b"moov"))):
+        assert outcome(tmp_path / str(n), changed)

@@ -1,0 +1,104 @@
+"""The .glb writer, read back by hand and by open3d."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d
+import pytest
+
+from pipelines.exports.formats.glb import linear_from_srgb, write_mesh
+from pipelines.exports.mesh import TriangleMesh
+
+VERTICES = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+COLORS = np.array([[0.5, 0.0, 1.0], [1.0, 1.0, 1.0], [0.02, 0.02, 0.02], [0.25, 0.5, 0.75]])
+NORMALS = np.array([[-1.0, -1, -1], [1, 0, 0], [0, 1, 0], [0, 0, 0]])
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "mesh.glb"
+    write_mesh(path, TriangleMesh(VERTICES, FACES, COLORS, NORMALS))
+    return path
+
+
+def parse(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """The JSON and each accessor's values, checked against the container's rules."""
+    data = path.read_bytes()
+    magic, version, total = struct.unpack_from("<4sII", data)
+    assert (magic, version, total) == (b"glTF", 2, len(data))
+    json_bytes, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    assert json_bytes % 4 == 0
+    document = json.loads(data[20 : 20 + json_bytes])
+    bin_bytes, kind = struct.unpack_from("<I4s", data, 20 + json_bytes)
+    assert kind == b"BIN\0"
+    assert bin_bytes % 4 == 0
+    binary = data[28 + json_bytes :]
+    assert len(binary) == bin_bytes == document["buffers"][0]["byteLength"]
+    types = {5126: "<f4", 5125: "<u4", 5123: "<u2"}
+    widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+    arrays = []
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        width = widths[accessor["type"]]
+        values = np.frombuffer(
+            binary,
+            types[accessor["componentType"]],
+            accessor["count"] * width,
+            view["byteOffset"],
+        )
+        assert values.nbytes == view["byteLength"]
+        arrays.append(values.reshape(-1, width))
+    return document, arrays
+
+
+def test_container_and_accessors_hold_the_mesh_y_up(file: Path) -> None:
+    document, (position, normal, _, index) = parse(file)
+    np.testing.assert_array_equal(
+        position, np.stack((VERTICES[:, 0], VERTICES[:, 2], -VERTICES[:, 1]), 1)
+    )
+    assert document["accessors"][0]["min"] == [0.0, 0.0, -3.0]
+    assert document["accessors"][0]["max"] == [2.0, 5.0, 0.0]
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, rtol=1e-6)
+    np.testing.assert_array_equal(index.reshape(-1, 3), FACES)
+
+
+def test_colors_are_linear_and_the_material_is_unlit_and_two_sided(file: Path) -> None:
+    document, (_, _, rgba, _) = parse(file)
+    np.testing.assert_allclose(rgba[:, :3] / 65535.0, linear_from_srgb(COLORS), atol=1e-5)
+    assert (rgba[:, 3] == 65535).all()
+    assert rgba[0, 0] / 65535.0 == pytest.approx(0.21404, abs=1e-4)
+    material = document["materials"][0]
+    assert material["doubleSided"] is True
+    assert "KHR_materials_unlit" in material["extensions"]
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert document["accessors"][2]["normalized"] is True
+
+
+def test_open3d_reads_the_same_mesh(file: Path) -> None:
+    mesh = open3d.io.read_triangle_mesh(str(file))
+    assert len(mesh.triangles) == 4
+    assert mesh.has_vertex_colors()
+    read = np.asarray(mesh.vertices)
+    order = [int(np.abs(read - wanted).sum(1).argmin()) for wanted in parse(file)[1][0]]
+    np.testing.assert_allclose(
+        np.asarray(mesh.vertex_colors)[order], linear_from_srgb(COLORS), atol=1e-4
+    )
+
+
+def test_a_mesh_that_gltf_cannot_hold_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.glb"
+    with pytest.raises(ValueError, match="without faces"):
+        write_mesh(path, TriangleMesh(VERTICES[:0], FACES[:0], COLORS[:0], NORMALS[:0]))
+    with pytest.raises(ValueError, match="does not exist"):
+        write_mesh(path, TriangleMesh(VERTICES[:3], FACES, COLORS[:3], NORMALS[:3]))
+    with pytest.raises(ValueError, match="must be like"):
+        write_mesh(path, TriangleMesh(VERTICES, FACES, COLORS[:3], NORMALS))
+    assert not path.exists()

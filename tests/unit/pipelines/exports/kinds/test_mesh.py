@@ -1,0 +1,65 @@
+"""The mesh stage on a tiny trained model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import open3d
+import pytest
+
+from pipelines.errors import Cancelled, ExportError
+from pipelines.exports.formats.ply import read_ply
+from pipelines.manifest import RunHooks
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.stages import tiny_job
+
+
+def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace) -> None:
+    summary = tiny_job.run(job, "mesh")["summary"]
+    mesh = read_ply(job.stage("mesh") / "mesh.ply")
+    assert len(mesh.faces) == summary["num_faces"] <= 3000 * (1.0 + 0.25 * len(summary["shells"]))
+    assert len(mesh.faces) > 50
+    assert mesh.colors is not None
+    assert mesh.colors.std() > 5.0
+    assert mesh.normals is not None
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-4)
+    _lie_within(mesh.points, [summary["bounds"], *summary["shells"]][-1])
+    glb = np.asarray(open3d.io.read_triangle_mesh(str(job.stage("mesh") / "mesh.glb")).vertices)
+    np.testing.assert_allclose(glb[:, 1].min(), mesh.points[:, 2].min(), atol=1e-4)
+    np.testing.assert_allclose(glb[:, 2].max(), -mesh.points[:, 1].min(), atol=1e-4)
+    files = {path.name for path in job.stage("mesh").iterdir()}
+    assert files == {"mesh.ply", "mesh.glb", "manifest.json"}
+
+
+def _lie_within(points: np.ndarray, bounds: dict[str, Any]) -> None:
+    low, high = (np.asarray(bounds[key]) for key in ("box_min", "box_max"))
+    assert np.all(points >= low - 1e-3)
+    assert np.all(points <= high + 1e-3)
+
+
+def test_the_subject_alone_ends_where_its_bounds_do(job: Workspace) -> None:
+    near = {"max_distance": 0.6, "max_faces": 3000}
+    subject = tiny_job.run(job, "mesh", extent="subject", **near)["summary"]
+    assert subject["shells"] == []
+    alone = read_ply(job.stage("mesh") / "mesh.ply")
+    _lie_within(alone.points, subject["bounds"])
+    scene = tiny_job.run(job, "mesh", extent="scene", **near)["summary"]
+    whole = read_ply(job.stage("mesh") / "mesh.ply")
+    assert scene["bounds"] == subject["bounds"]
+    assert len(scene["shells"]) >= 1
+    assert np.ptp(whole.points, axis=0).max() > 1.2 * np.ptp(alone.points, axis=0).max()
+
+
+def test_a_crop_that_holds_nothing_is_an_error(job: Workspace) -> None:
+    with pytest.raises(ExportError) as caught:
+        tiny_job.run(job, "mesh", max_distance=1e-6, extent="subject")
+    assert caught.value.code == "empty_mesh"
+    assert "max_distance" in caught.value.hint
+    assert not job.stage("mesh").exists()
+
+
+def test_a_cancel_ends_the_stage(job: Workspace) -> None:
+    with pytest.raises(Cancelled):
+        tiny_job.run_with(job, "mesh", RunHooks(is_cancelled=lambda: True))
+    assert not job.stage("mesh").exists()

@@ -1,0 +1,130 @@
+"""The video's camera path: near the captured poses, smooth, with unit rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.exports.paths.smooth import Floats, smooth_path
+from pipelines.scene.capture_order import capture_order, nearest_pose_distance
+from pipelines.scene.focus import find_focus
+from tests.unit.pipelines.scene.synthetic_views import arc, look_at
+
+
+def test_path_stays_near_the_captured_poses() -> None:
+    poses = arc(40)
+    path = smooth_path(poses, 96)
+    gaps = np.linalg.norm(path[:, None, :, 3] - poses[None, :, :, 3], axis=-1)
+    spacing = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1).mean()
+    assert gaps.min(axis=1).max() < spacing
+    assert gaps.min(axis=0).max() < spacing
+    axes = -path[:, :, 2]
+    to_origin = -path[:, :, 3] / np.linalg.norm(path[:, :, 3], axis=1, keepdims=True)
+    assert (axes * to_origin).sum(axis=1).min() > np.cos(np.radians(5.0))
+
+
+def test_path_is_smoother_than_a_shaking_hand() -> None:
+    poses = arc(100, shake=0.02)
+    path = smooth_path(poses, 100)
+    shaking = np.linalg.norm(np.diff(poses[:, :, 3], n=2, axis=0), axis=1).mean()
+    smoothed = np.linalg.norm(np.diff(path[:, :, 3], n=2, axis=0), axis=1).mean()
+    assert smoothed < shaking / 20.0
+
+
+def test_speed_is_nearly_constant_where_the_walk_was_not() -> None:
+    poses = arc(120)
+    uneven = poses[np.unique((np.linspace(0, 1, 60) ** 2 * 119).astype(int))]
+    steps = np.linalg.norm(np.diff(smooth_path(uneven, 80)[:, :, 3], axis=0), axis=1)
+    assert steps.max() < 1.3 * steps.min()
+
+
+def test_rotations_are_rotations() -> None:
+    rotation = smooth_path(arc(30, shake=0.05), 64)[:, :, :3]
+    identity = np.broadcast_to(np.eye(3), rotation.shape)
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), identity, atol=1e-12)
+    assert np.all(np.linalg.det(rotation) > 0.999)
+
+
+def test_a_gap_in_the_poses_is_bridged_without_a_jump() -> None:
+    poses = arc(40)
+    path = smooth_path(np.concatenate((poses[:10], poses[25:])), 96)
+    steps = np.linalg.norm(np.diff(path[:, :, 3], axis=0), axis=1)
+    assert np.all(np.isfinite(path))
+    assert steps.max() < 2.0 * np.median(steps)
+
+
+def test_a_gap_is_passed_around_the_subject_and_not_through_it() -> None:
+    poses = arc(60)
+    path = smooth_path(np.concatenate((poses[:8], poses[-8:])), 96, focus=np.zeros(3))
+    distance = np.linalg.norm(path[:, :, 3], axis=1)
+    wanted = np.linalg.norm(poses[0, :, 3])
+    np.testing.assert_allclose(distance, wanted, rtol=0.02)
+    middle = nearest_pose_distance(path, np.concatenate((poses[:8], poses[-8:])))[48]
+    assert middle > 10.0 * nearest_pose_distance(path, path).max()
+
+
+@pytest.mark.parametrize("num", [1, 2, 3])
+def test_few_poses_still_make_a_path(num: int) -> None:
+    path = smooth_path(arc(40)[:: 40 // num][:num], 24)
+    assert path.shape == (24, 3, 4)
+    assert np.all(np.isfinite(path))
+
+
+def test_no_poses_are_refused() -> None:
+    with pytest.raises(ValueError, match="needs poses"):
+        smooth_path(np.empty((0, 3, 4)), 10)
+
+
+def photos_around(num: int = 25, aside_deg: float = 6.3, seed: int = 0) -> Floats:
+    """Photos from all over a hemisphere that look past the origin by so much at most."""
+    rng = np.random.default_rng(seed)
+    poses = []
+    for _ in range(num):
+        turn, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.05, 0.95)
+        flat = np.sqrt(1.0 - height**2)
+        away = np.array([flat * np.cos(turn), flat * np.sin(turn), height])
+        place = rng.uniform(2.0, 3.0) * away
+        beside = np.cross(away, rng.normal(size=3))
+        beside /= np.linalg.norm(beside)
+        shift = np.linalg.norm(place) * np.tan(np.radians(aside_deg * rng.uniform()))
+        poses.append(look_at(place, shift * beside))
+    return np.stack(poses)
+
+
+def aside_deg(poses: Floats, point: Floats) -> Floats:
+    """[N] angles between the optical axes and the direction to a point."""
+    to_point = point - poses[:, :, 3]
+    cosine = -(poses[:, :, 2] * to_point).sum(axis=1) / np.linalg.norm(to_point, axis=1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def in_picture(poses: Floats, point: Floats) -> np.ndarray:
+    """[N] whether a point is in the picture of a phone held upright, 43 by 70 degrees."""
+    x, y, z = np.einsum("nji,nj->in", poses[:, :, :3], point - poses[:, :, 3])
+    return np.asarray((z < 0) & (np.abs(x) < -0.39 * z) & (np.abs(y) < -0.7 * z))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_subject_stays_in_the_picture_where_photos_are_few(seed: int) -> None:
+    photos = photos_around(seed=seed)
+    focus = find_focus(photos)
+    assert focus is not None
+    assert in_picture(photos, focus).all()
+    order = capture_order(photos, [f"{i}.jpg" for i in range(25)], [None] * 25)
+    path = smooth_path(photos[order], 240, focus)
+    assert in_picture(path, focus).all()
+    assert aside_deg(path, focus).max() <= aside_deg(photos, focus).max()
+
+
+def test_the_subject_may_leave_the_picture_where_the_photos_left_it() -> None:
+    """A look to the side in the middle of a walk stays one, and where the walk was true so is
+    the flight."""
+    poses = arc(90)
+    for index in range(30, 60):
+        place = poses[index, :, 3]
+        poses[index] = look_at(place, place + np.cross(place, [0.0, 0.0, 1.0]))
+    path = smooth_path(poses, 90, np.zeros(3))
+    aside = aside_deg(path, np.zeros(3))
+    assert aside[40:50].min() > 60.0
+    assert aside[:15].max() < 5.0
+    assert aside[-15:].max() < 5.0

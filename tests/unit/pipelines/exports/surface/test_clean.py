@@ -1,0 +1,74 @@
+"""Cleaning and simplifying a mesh: what stays, what goes, and in which order."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d
+import pytest
+
+from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.surface.clean import clean
+from pipelines.exports.surface.open3d_mesh import to_open3d
+from pipelines.exports.surface.tsdf import fuse
+from pipelines.scene.bounds import SceneBounds
+from pipelines.scene.depth_views import DepthView, Pinhole
+from tests.unit.pipelines.scene.synthetic_views import ring, sphere_view
+
+CENTER = np.array([1000.0, -500.0, 7.0])
+
+
+def bounds_around(center: np.ndarray, half: float = 1.3) -> SceneBounds:
+    return SceneBounds(center, 3.0, 6.0, center - half, center + half)
+
+
+@pytest.fixture(scope="module")
+def sphere() -> TriangleMesh:
+    made = open3d.geometry.TriangleMesh.create_sphere(1.0, 40)
+    points = np.asarray(made.vertices)
+    return TriangleMesh(
+        points + CENTER, np.asarray(made.triangles, np.int32), 0.5 + 0.3 * points, points
+    )
+
+
+def test_cleaning_simplifies_and_keeps_the_shape(sphere: TriangleMesh) -> None:
+    mesh = clean(sphere, bounds_around(CENTER), 800)
+    assert 400 < len(mesh.faces) <= 800
+    assert np.abs(np.linalg.norm(mesh.vertices - CENTER, axis=1) - 1.0).max() < 0.05
+    assert mesh.colors.shape == mesh.normals.shape == mesh.vertices.shape
+
+
+def test_small_loose_pieces_and_what_is_out_of_bounds_are_dropped(sphere: TriangleMesh) -> None:
+    speck = np.array([[1.2, 0, 0], [1.25, 0, 0], [1.2, 0.05, 0]]) + CENTER
+    both = TriangleMesh(
+        np.concatenate((sphere.vertices, speck)),
+        np.concatenate((sphere.faces, np.arange(3, dtype=np.int32)[None] + len(sphere.vertices))),
+        np.concatenate((sphere.colors, np.zeros((3, 3)))),
+        np.concatenate((sphere.normals, np.tile([0.0, 0, 1], (3, 1)))),
+    )
+    mesh = clean(both, bounds_around(CENTER), 10**6)
+    assert np.linalg.norm(mesh.vertices - CENTER, axis=1).max() < 1.1
+    half = SceneBounds(CENTER, 3.0, 6.0, CENTER - 1.3, CENTER + np.array([0.0, 1.3, 1.3]))
+    assert clean(both, half, 10**6).vertices[:, 0].max() <= CENTER[0]
+
+
+def noisy_view(lens: Pinhole, pose: np.ndarray, rng: np.random.Generator) -> DepthView:
+    view = sphere_view(lens, pose, CENTER)
+    noise = 1.0 + 0.01 * rng.normal(size=view.z_depth.shape)
+    z_depth = np.where(view.z_depth > 0, view.z_depth * noise, 0.0).astype(np.float32)
+    return DepthView(lens, pose, view.rgb, z_depth)
+
+
+def test_simplifying_leaves_no_crumbs() -> None:
+    """A rough surface hangs together by single edges, which decimation tears."""
+    rng = np.random.default_rng(0)
+    lens = Pinhole(160, 120, 150.0, 150.0, 80.0, 60.0)
+    views = [noisy_view(lens, pose, rng) for pose in ring(12, CENTER)]
+    fused = fuse(views, bounds_around(CENTER), 2.6 / 64)
+    mesh = clean(fused, bounds_around(CENTER), 2000)
+    assert len(mesh.faces) > 1000
+    areas = np.asarray(to_open3d(mesh, CENTER).cluster_connected_triangles()[2])
+    assert areas.min() >= 0.02 * areas.max()
+
+
+def test_nothing_inside_the_bounds_leaves_nothing(sphere: TriangleMesh) -> None:
+    assert len(clean(sphere, bounds_around(CENTER + 100.0), 1000).vertices) == 0

@@ -1,0 +1,61 @@
+"""Points and normals from exact depth views."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.exports.surface.cloud import (
+    Cloud,
+    gather,
+    oriented_normals,
+    thinned,
+    without_outliers,
+)
+from pipelines.scene.bounds import SceneBounds
+from pipelines.scene.consistency import consistent
+from pipelines.scene.depth_views import DepthView, Pinhole
+from tests.unit.pipelines.scene.synthetic_views import ring, sphere_color, sphere_view
+
+CENTER = np.array([20.0, 5.0, -3.0])
+LENS = Pinhole(80, 60, 75.0, 75.0, 40.0, 30.0)
+BOUNDS = SceneBounds(CENTER, 3.0, 6.0, CENTER - 1.3, CENTER + 1.3)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[DepthView]:
+    return [sphere_view(LENS, pose, CENTER) for pose in ring(12, CENTER)]
+
+
+def test_points_and_normals_of_a_sphere_are_exact(views: list[DepthView]) -> None:
+    cloud = gather(views, BOUNDS)
+    outward = cloud.points - CENTER
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(cloud.colors / 255.0, sphere_color(cloud.points, CENTER), atol=0.01)
+    assert consistent(cloud.points, views).mean() > 0.99
+    normals = oriented_normals(cloud, CENTER)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    assert np.median((normals * outward).sum(axis=1)) > 0.98
+    assert (normals * outward).sum(axis=1).min() > 0.0
+
+
+def test_a_point_far_from_all_others_goes(views: list[DepthView]) -> None:
+    cloud = gather(views, BOUNDS)
+    lonely = Cloud(
+        np.concatenate((cloud.points, CENTER[None] + 5.0)),
+        np.concatenate((cloud.colors, cloud.colors[:1])),
+        np.concatenate((cloud.eyes, cloud.eyes[:1])),
+    )
+    kept = without_outliers(lonely, CENTER)
+    assert np.linalg.norm(kept.points - CENTER, axis=1).max() < 1.01
+    assert len(kept) > 0.9 * len(cloud)
+
+
+def test_thinning_keeps_points_with_what_belongs_to_them(views: list[DepthView]) -> None:
+    cloud = gather(views, BOUNDS)
+    few = thinned(cloud, 100, seed=1)
+    assert len(few) == 100
+    index = [int(np.abs(cloud.points - point).sum(axis=1).argmin()) for point in few.points]
+    np.testing.assert_array_equal(few.colors, cloud.colors[index])
+    np.testing.assert_array_equal(few.points, thinned(cloud, 100, seed=1).points)
+    assert len(thinned(few, 200, seed=1)) == 100

@@ -1,0 +1,103 @@
+"""A ball in a large round room: fine around the ball, coarse walls beyond, nothing twice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.surface.shells import Shell, find_shells, fuse_shells
+from pipelines.scene.bounds import bounds_of_views
+from pipelines.scene.depth_views import DepthView, Pinhole, ViewStore
+from tests.unit.pipelines.scene.synthetic_views import ring, sphere_view
+
+CENTER = np.array([1000.0, -500.0, 7.0])
+LENS = Pinhole(160, 120, 75.0, 75.0, 80.0, 60.0)
+WALL = 20.0
+
+
+def room_view(pose: np.ndarray) -> DepthView:
+    """The unit ball and, behind it, the inside of a ball of radius 20."""
+    view = sphere_view(LENS, pose, CENTER)
+    world = LENS.directions() @ pose[:, :3].T
+    start = pose[:, 3] - CENTER
+    a, b = (world**2).sum(axis=-1), (world * start).sum(axis=-1)
+    far = (-b + np.sqrt(b * b - a * ((start**2).sum() - WALL**2))) / a
+    return replace(view, z_depth=np.where(view.z_depth > 0, view.z_depth, far).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> ViewStore:
+    store = ViewStore(tmp_path_factory.mktemp("views"))
+    for pose in ring(24, CENTER):
+        store.append(room_view(pose))
+    return store
+
+
+def shells_of(views: ViewStore, far_distance: float) -> list[Shell]:
+    seen = list(views)
+    poses = np.stack([view.world_from_camera for view in seen])
+    return find_shells(
+        lambda distance: bounds_of_views(seen, poses, distance), 1.5, far_distance, 64
+    )
+
+
+@pytest.fixture(scope="module")
+def mesh(views: ViewStore) -> TriangleMesh:
+    return fuse_shells(views, shells_of(views, 12.0), 20_000)
+
+
+def test_voxels_grow_with_the_reach(views: ViewStore) -> None:
+    shells = shells_of(views, 12.0)
+    inner, outer = shells[0], shells[-1]
+    assert inner.bounds.longest_side < 3.0
+    assert outer.bounds.longest_side > 30.0
+    assert inner.voxel == pytest.approx(inner.bounds.longest_side / 64)
+    assert outer.voxel == pytest.approx(inner.voxel * 8.0)
+
+
+def test_there_is_no_shell_where_there_is_nothing_new(views: ViewStore) -> None:
+    assert len(shells_of(views, 1.5)) == 1
+    assert len(shells_of(views, 1000.0)) == len(shells_of(views, 13.0))
+
+
+def test_the_ball_is_fine_and_the_walls_are_there(mesh: TriangleMesh) -> None:
+    off = np.linalg.norm(mesh.vertices - CENTER, axis=1)
+    ball, wall = np.abs(off - 1.0) < 0.1, np.abs(off - WALL) < 0.6
+    assert (ball | wall).mean() > 0.999
+    assert np.abs(off[ball] - 1.0).mean() < 0.01
+    assert wall.sum() > 300
+    directions = (mesh.vertices[wall] - CENTER) / off[wall, None]
+    octants = (directions > 0) @ np.array([1, 2, 4])
+    assert len(np.unique(octants)) == 8, "walls on all sides"
+
+
+def test_no_surface_is_there_twice(mesh: TriangleMesh) -> None:
+    """Coarse faces where the fine shell has its own would lie among them, too large by far."""
+    corners = mesh.vertices[mesh.faces]
+    on_ball = (np.linalg.norm(corners - CENTER, axis=-1) < 1.2).all(axis=1)
+    sides = np.linalg.norm(corners[on_ball] - np.roll(corners[on_ball], 1, axis=1), axis=-1)
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    assert area[on_ball].sum() < 1.1 * 4.0 * np.pi
+    assert sides.max() < 0.3
+
+
+def test_progress_goes_through_all_shells(views: ViewStore) -> None:
+    told: list[float] = []
+    fuse_shells(views, shells_of(views, 12.0), 1000, told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_views_without_surface_have_no_shells(tmp_path: Path) -> None:
+    store = ViewStore(tmp_path)
+    for pose in ring(4, CENTER):
+        view = sphere_view(LENS, pose, CENTER)
+        store.append(replace(view, z_depth=np.zeros_like(view.z_depth)))
+    assert shells_of(store, 12.0) == []
+    assert len(fuse_shells(store, [], 1000).faces) == 0

@@ -1,0 +1,138 @@
+"""Fusing depth views: the surface where it is, the right way out, in the world frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.surface.clean import clean
+from pipelines.exports.surface.tsdf import fuse
+from pipelines.scene.bounds import SceneBounds
+from pipelines.scene.cameras_file import Intrinsics
+from pipelines.scene.depth_views import DepthView, Pinhole, ViewStore, z_depth_of
+from tests.unit.pipelines.scene.synthetic_views import ring, sphere_color, sphere_view
+
+CENTER = np.array([1000.0, -500.0, 7.0])
+RESOLUTION = 64
+VOXEL = 2.6 / RESOLUTION
+LENS = Pinhole(160, 120, 150.0, 150.0, 80.0, 60.0)
+
+
+def bounds_around(center: np.ndarray, half: float = 1.3) -> SceneBounds:
+    return SceneBounds(center, 3.0, 6.0, center - half, center + half)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[DepthView]:
+    return [sphere_view(LENS, pose, CENTER) for pose in ring(12, CENTER)]
+
+
+@pytest.fixture(scope="module")
+def sphere(views: list[DepthView]) -> TriangleMesh:
+    return fuse(views, bounds_around(CENTER), VOXEL)
+
+
+def test_vertices_lie_within_a_voxel_of_the_sphere(sphere: TriangleMesh) -> None:
+    voxel = 2.6 / RESOLUTION
+    off = np.abs(np.linalg.norm(sphere.vertices - CENTER, axis=1) - 1.0)
+    assert len(sphere.vertices) > 2000
+    assert off.max() < voxel
+    assert off.mean() < 0.2 * voxel
+
+
+def test_faces_and_normals_point_outwards(sphere: TriangleMesh) -> None:
+    a, b, c = (sphere.vertices[sphere.faces[:, i]] for i in range(3))
+    facing = (np.cross(b - a, c - a) * (a - CENTER)).sum(axis=1)
+    assert (facing > 0).mean() > 0.99
+    outward = sphere.vertices - CENTER
+    assert (outward * sphere.normals).sum(axis=1).min() > 0.7
+
+
+def test_colors_are_those_seen(sphere: TriangleMesh) -> None:
+    wanted = sphere_color(sphere.vertices, CENTER)
+    assert np.abs(sphere.colors - wanted).mean() < 0.02
+
+
+def test_a_ghost_seen_by_one_view_is_carved_away_by_the_others(views: list[DepthView]) -> None:
+    haunted = views[0].z_depth.copy()
+    haunted[55:65, 75:85] = 1.0
+    ghost = DepthView(LENS, views[0].world_from_camera, views[0].rgb, haunted)
+    mesh = clean(fuse([ghost, *views[1:]], bounds_around(CENTER, 2.5), 5.0 / 128), _wide(), 10**6)
+    off = np.abs(np.linalg.norm(mesh.vertices - CENTER, axis=1) - 1.0)
+    assert off.max() < 0.1
+
+
+@pytest.mark.parametrize(("num_views", "is_believed"), [(1, False), (2, True), (3, True)])
+def test_a_surface_takes_two_views(
+    views: list[DepthView], num_views: int, is_believed: bool
+) -> None:
+    mesh = fuse([views[0]] * num_views, bounds_around(CENTER), VOXEL)
+    assert (len(mesh.faces) > 1000) == is_believed
+
+
+def _wide() -> SceneBounds:
+    return bounds_around(CENTER, 2.5)
+
+
+def test_nothing_inside_the_bounds_gives_an_empty_mesh(views: list[DepthView]) -> None:
+    far = bounds_around(CENTER + 100.0)
+    assert len(fuse(views, far, 2.6 / 32).vertices) == 0
+
+
+def test_a_view_with_a_speck_of_surface_takes_nothing_from_the_others(
+    views: list[DepthView], sphere: TriangleMesh
+) -> None:
+    """Open3D looks at every fourth pixel, and fails where none of those is wanted."""
+    first = views[0]
+    middle = first.z_depth[60, 80]
+    speck = np.zeros_like(first.z_depth)
+    speck[57:60, 77:80] = middle
+    small = DepthView(LENS, first.world_from_camera, first.rgb, speck)
+    assert small.smooth_mask().any()
+    fused = fuse([small, *views], bounds_around(CENTER), VOXEL)
+    assert len(fused.vertices) == pytest.approx(len(sphere.vertices), rel=0.05)
+
+
+def test_the_store_gives_back_what_it_was_given(views: list[DepthView], tmp_path: Path) -> None:
+    store = ViewStore(tmp_path / "views")
+    for view in views:
+        store.append(view)
+    assert len(store) == len(views)
+    for kept, view in zip(store, views, strict=True):
+        np.testing.assert_array_equal(kept.z_depth, view.z_depth)
+        np.testing.assert_array_equal(kept.rgb, view.rgb)
+        np.testing.assert_array_equal(kept.world_from_camera, view.world_from_camera)
+
+
+def test_points_of_a_view_lie_on_the_surface(views: list[DepthView]) -> None:
+    view = views[1]
+    seen = view.points()[view.z_depth > 0]
+    np.testing.assert_allclose(np.linalg.norm(seen - CENTER, axis=1), 1.0, atol=1e-5)
+
+
+def test_jumps_in_depth_are_masked_and_slopes_are_not(views: list[DepthView]) -> None:
+    view = views[0]
+    mask = view.smooth_mask()
+    seen = view.z_depth > 0
+    assert mask[60, 80]
+    assert 0.85 < mask.sum() / seen.sum() < 1.0
+
+
+def test_z_depth_takes_the_median_where_the_expected_depth_was_pulled_away() -> None:
+    lens = Pinhole(3, 1, 1.0, 1.0, 1.5, 0.5)
+    median = np.array([[2.0, 2.0, 2.0]])
+    expected = np.array([[2.02, 4.0, 2.0]])
+    z = z_depth_of(lens, median, expected, np.array([[1.0, 1.0, 0.2]]))
+    np.testing.assert_allclose(z, [[2.02 / np.sqrt(2.0), 2.0, 0.0]], rtol=1e-6)
+
+
+def test_an_undistorted_lens_keeps_the_field_of_view_and_cuts_a_fisheye() -> None:
+    lens = Pinhole.of(Intrinsics(1080, 1920, 1400.0, 1410.0, 545.0, 950.0, k1=0.1), 480, 2)
+    assert (lens.width, lens.height) == (270, 480)
+    assert lens.width / lens.fl_x == pytest.approx(1080 / 1400.0)
+    assert lens.cx / lens.width == pytest.approx(545.0 / 1080.0)
+    fisheye = Pinhole.of(Intrinsics(1000, 1000, 300.0, 300.0, 500, 500, "OPENCV_FISHEYE"), 500)
+    assert 2 * np.degrees(np.arctan(250 / fisheye.fl_x)) == pytest.approx(110.0)

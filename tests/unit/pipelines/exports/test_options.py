@@ -1,0 +1,48 @@
+"""Options of rendering, from a job's options to what the renderer is given."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipelines.exports.options import RenderingOptions, render_config
+from pipelines.nerf.options.render import RenderConfig
+from pipelines.options import OptionsError, evaluate_config, resolve_options, stage_options
+
+RENDERING_STAGES = ("video", "mesh", "pointcloud")
+
+
+@pytest.mark.parametrize("stage", RENDERING_STAGES)
+def test_a_stage_renders_with_its_own_options(stage: str) -> None:
+    given = {"render": {"baked_cells": 0, "skip_below": 0.02}}
+    resolved = resolve_options("preview", {stage: given})
+    options = stage_options(stage, resolved[stage])
+    assert isinstance(options, RenderingOptions)
+    assert render_config(options) == RenderConfig(baked_cells=0, skip_below=0.02)
+    others = {name for name in RENDERING_STAGES if name != stage}
+    for name in others:
+        untouched = stage_options(name, resolved[name])
+        assert isinstance(untouched, RenderingOptions)
+        assert render_config(untouched) == RenderConfig()
+
+
+def test_the_evaluation_measures_what_the_stages_render_unless_told_otherwise() -> None:
+    resolved = resolve_options("preview", {})
+    assert evaluate_config(stage_options("evaluate", resolved["evaluate"])).render == RenderConfig()
+    changed = resolve_options("preview", {"evaluate": {"render": {"color_weight": 0.0}}})
+    config = evaluate_config(stage_options("evaluate", changed["evaluate"]))
+    assert config.render == RenderConfig(color_weight=0.0)
+
+
+def test_options_of_jobs_from_before_there_were_any_are_still_read() -> None:
+    values = dict(resolve_options("preview", {})["video"])
+    del values["render"]
+    options = stage_options("video", values)
+    assert isinstance(options, RenderingOptions)
+    assert render_config(options) == RenderConfig()
+
+
+@pytest.mark.parametrize("wrong", [{"baked_cells": -1}, {"early_stop": 0.9}, {"speed": 2}])
+def test_wrong_values_are_refused_with_their_path(wrong: dict[str, object]) -> None:
+    with pytest.raises(OptionsError) as caught:
+        resolve_options("preview", {"mesh": {"render": wrong}})
+    assert f"mesh.render.{next(iter(wrong))}" in str(caught.value)

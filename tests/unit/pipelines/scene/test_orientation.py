@@ -1,0 +1,151 @@
+"""Gravity and normalisation, on cameras whose true frame is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.scene.orientation import (
+    Similarity,
+    find_up,
+    normalise,
+    opengl_from_opencv,
+    rotation_to_z,
+)
+
+
+def random_rotation(seed: int) -> np.ndarray:
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def look_at(center: np.ndarray, target: np.ndarray, roll_deg: float = 0.0) -> np.ndarray:
+    """An OpenGL camera [3, 4] in a +Z-up world with a level X axis, then rolled."""
+    z = (center - target) / np.linalg.norm(center - target)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    return np.stack([c * x + s * y, c * y - s * x, z, center], axis=1)
+
+
+def orbit(num: int = 24, height: float = 1.5, arc_deg: float = 360.0) -> np.ndarray:
+    """Cameras on an arc of radius 2 that look down at the point (1, 2, 0)."""
+    target = np.array([1.0, 2.0, 0.0])
+    angles = np.radians(np.linspace(0.0, arc_deg, num, endpoint=False))
+    rings = np.stack([2 * np.cos(angles), 2 * np.sin(angles), np.full(num, height)], axis=1)
+    return np.stack([look_at(target + ring, target) for ring in rings])
+
+
+def moved(cameras: np.ndarray, seed: int) -> np.ndarray:
+    """The cameras in a frame turned, shifted and scaled at random."""
+    similarity = Similarity(random_rotation(seed), np.array([5.0, -3.0, 2.0]), 3.7)
+    return similarity.apply_to_cameras(cameras)
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    cosine = a @ b / np.linalg.norm(a) / np.linalg.norm(b)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("arc_deg", [360.0, 90.0])
+def test_turned_cameras_that_look_down_come_back_upright(seed: int, arc_deg: float) -> None:
+    truth = orbit(arc_deg=arc_deg)
+    found = normalise(moved(truth, seed))
+    assert found.up_from == "vertical"
+    back = found.similarity.apply_to_cameras(moved(truth, seed))
+    np.testing.assert_allclose(back[:, 2, :3], truth[:, 2, :3], atol=1e-9)
+
+
+def test_the_focus_becomes_the_origin_and_cameras_fill_the_unit_cube() -> None:
+    cameras = moved(orbit(), 3)
+    found = normalise(cameras)
+    assert found.centered_on == "focus"
+    focus = Similarity(random_rotation(3), np.array([5.0, -3.0, 2.0]), 3.7).apply_to_points(
+        np.array([1.0, 2.0, 0.0])
+    )
+    np.testing.assert_allclose(found.similarity.apply_to_points(focus), 0.0, atol=1e-9)
+    back = found.similarity.apply_to_cameras(cameras)
+    assert np.abs(back[:, :, 3]).max() == pytest.approx(1.0)
+    np.testing.assert_allclose(
+        back[:, :, :3] @ back[:, :, :3].transpose(0, 2, 1), np.eye(3)[None].repeat(24, 0), atol=1e-9
+    )
+
+
+def test_a_few_rolled_cameras_do_not_tilt_the_rest() -> None:
+    truth = orbit(num=20)
+    target = np.array([1.0, 2.0, 0.0])
+    for index in (2, 9, 15):
+        truth[index] = look_at(truth[index][:, 3], target, roll_deg=90.0)
+    up, found_by = find_up(moved(truth, 1))
+    assert found_by == "vertical"
+    assert angle_deg(up, random_rotation(1) @ [0, 0, 1]) < 0.5
+
+
+def test_shaky_hands_cost_little() -> None:
+    rng = np.random.default_rng(0)
+    target = np.array([1.0, 2.0, 0.0])
+    truth = np.stack([look_at(pose[:, 3], target, rng.normal(scale=4.0)) for pose in orbit(num=60)])
+    up, _ = find_up(moved(truth, 2))
+    assert angle_deg(up, random_rotation(2) @ [0, 0, 1]) < 2.0
+
+
+def test_cameras_that_look_straight_down_know_up_by_their_gaze() -> None:
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    cameras = []
+    for a in angles:
+        x, z = np.array([np.cos(a), np.sin(a), 0.0]), np.array([0.0, 0.0, 1.0])
+        cameras.append(np.stack([x, np.cross(z, x), z, [np.cos(a), np.sin(a), 3.0]], axis=1))
+    up, _ = find_up(moved(np.stack(cameras), 4))
+    assert angle_deg(up, random_rotation(4) @ [0, 0, 1]) < 1e-3
+
+
+def test_parallel_cameras_fall_back_to_their_own_up() -> None:
+    """Cameras that slide sideways without turning: X axes alone leave up undetermined."""
+    cameras = np.stack(
+        [look_at(np.array([x, -3.0, 1.0]), np.array([x, 0.0, 1.0])) for x in np.linspace(-1, 1, 9)]
+    )
+    up, found_by = find_up(moved(cameras, 5))
+    assert found_by == "camera_up"
+    assert angle_deg(up, random_rotation(5) @ [0, 0, 1]) < 1e-3
+    found = normalise(moved(cameras, 5))
+    assert found.centered_on == "centers"
+    back = found.similarity.apply_to_cameras(moved(cameras, 5))
+    np.testing.assert_allclose(back[:, :, 3].mean(axis=0), 0.0, atol=1e-9)
+
+
+def test_without_orientation_axes_stay_parallel() -> None:
+    found = normalise(moved(orbit(), 6), orient=False)
+    np.testing.assert_allclose(found.similarity.rotation, np.eye(3), atol=1e-12)
+    assert found.up_from == "none"
+
+
+def test_cameras_in_one_point_keep_their_scale() -> None:
+    cameras = orbit()
+    cameras[:, :, 3] = 4.0
+    assert normalise(cameras).similarity.scale == 1.0
+
+
+def test_no_cameras_are_refused() -> None:
+    with pytest.raises(ValueError, match="no cameras"):
+        find_up(np.zeros((0, 3, 4)))
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0.0, -0.8]])
+def test_the_rotation_to_z_is_a_rotation_to_z(up: list[float]) -> None:
+    rotation = rotation_to_z(np.array(up, float))
+    np.testing.assert_allclose(rotation @ up, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+def test_opencv_cameras_turn_about_their_own_x_axis() -> None:
+    """OpenCV's +Z is the gaze and +Y points down; ours look along -Z with +Y up."""
+    pose = np.concatenate([random_rotation(7), [[1.0], [2.0], [3.0]]], axis=1)[None]
+    ours = opengl_from_opencv(pose)[0]
+    np.testing.assert_array_equal(ours[:, 0], pose[0, :, 0])
+    np.testing.assert_array_equal(ours[:, 1], -pose[0, :, 1])
+    np.testing.assert_array_equal(-ours[:, 2], pose[0, :, 2])
+    np.testing.assert_array_equal(ours[:, 3], pose[0, :, 3])

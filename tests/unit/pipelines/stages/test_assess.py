@@ -1,0 +1,222 @@
+"""The assess stage on a job whose mesh and cloud are known: it needs no trained model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.errors import ExportError
+from pipelines.exports.formats.ply import write_mesh, write_points
+from pipelines.exports.mesh import TriangleMesh
+from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.sample.film import phone_camera
+from pipelines.sample.scene import depth_image, pixel_rays, pose_matrix, raycast
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.depth_maps_file import DepthMapsWriter
+from pipelines.scene.depth_views import Pinhole
+from pipelines.stages.assess import DEPTH_UNIT_NOTE
+from pipelines.workspace import MANIFEST, Workspace
+from tests.unit.pipelines.stages import tiny_job
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Workspace:
+    """A tiny capture with every fourth image held out, as training writes it down."""
+    workspace = tiny_job.make_capture(tmp_path / "job")
+    cameras = CamerasFile.load(workspace.stage("ingest") / "cameras.json")
+    images = tuple(
+        replace(image, split="train" if number % 4 else "test")
+        for number, image in enumerate(cameras.images)
+    )
+    workspace.stage("train").mkdir()
+    replace(cameras, images=images).save(workspace.stage("train") / "cameras.json")
+    _publish(workspace, "train")
+    return workspace
+
+
+def _publish(job: Workspace, stage: str) -> None:
+    job.stage(stage).mkdir(exist_ok=True)
+    manifest = {"stage": stage, "content": stage, "summary": {}, "timings": {"wall_s": 1.0}}
+    (job.stage(stage) / MANIFEST).write_text(
+        json.dumps({**manifest, "options": {}, "files": []}), "utf-8"
+    )
+
+
+def _exact_assets(job: Workspace, keep: float = 1.0, floaters: float | None = 0.004) -> None:
+    """Mesh and cloud of the true surface as all cameras see it, in the scene's own colours.
+
+    keep: share of each picture's columns that the mesh covers, from the left.
+    """
+    lens = phone_camera(96)
+    vertices, colors, faces, offset = [], [], [], 0
+    for image in CamerasFile.load(job.stage("train") / "cameras.json").images:
+        pose = pose_matrix(image)
+        y, x = np.mgrid[0 : lens.height, 0 : round(keep * lens.width)]
+        pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+        origins, directions = pixel_rays(lens, pose, pixels)
+        hits = raycast(origins, directions)
+        vertices.append(origins + hits.t[:, None] * directions)
+        colors.append(hits.color)
+        index = np.arange(len(pixels)).reshape(x.shape)
+        corners = np.stack([index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]], -1)
+        quads = corners[np.ptp(hits.t[corners], axis=-1) < 0.1]
+        faces += [offset + quads[:, [0, 1, 2]], offset + quads[:, [2, 1, 3]]]
+        offset += len(pixels)
+    shades = np.concatenate(colors)
+    painted = np.rint(255 * shades).astype(np.uint8)
+    for stage in ("mesh", "pointcloud", "evaluate"):
+        _publish(job, stage)
+    points = np.concatenate(vertices)
+    upward = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    mesh = TriangleMesh(points, np.concatenate(faces).astype(np.int32), shades, upward)
+    write_mesh(job.stage("mesh") / "mesh.ply", mesh)
+    write_points(job.stage("pointcloud") / "pointcloud.ply", points, painted)
+    found = None if floaters is None else {"depth_inconsistency": floaters}
+    (job.stage("evaluate") / "metrics.json").write_text(json.dumps({"floaters": found}), "utf-8")
+
+
+def test_the_true_surface_covers_the_photos_and_looks_like_them(job: Workspace) -> None:
+    _exact_assets(job)
+    assets = tiny_job.run(job, "assess", long_side_px=64, num_pictures=2)["summary"]
+    assert assets == json.loads((job.stage("assess") / "assets.json").read_text())
+    assert assets["views"]["held_out"] is True
+    assert assets["views"]["num_views"] == len(assets["per_view"]) == 5
+    assert (assets["views"]["width"], assets["views"]["height"]) == (36, 64)
+    # Faces across edges of things are left out, so a few pixels stay open.
+    assert assets["mesh"]["coverage"] > 0.88
+    assert assets["mesh"]["psnr"] > 22.0
+    assert assets["mesh"]["ssim"] > 0.85
+    assert assets["cloud"]["coverage"] > 0.97
+    # The nearest of many points of fine paint: a pixel's neighbour as often as not.
+    assert assets["cloud"]["psnr"] > 15.0
+    assert assets["cloud"]["median_spacing"] > 0.0
+    assert assets["warnings"] == []
+    assert (assets["depth"], assets["depth_agreement"]) == (None, None)
+    assert assets["depth_reason"]
+    assert assets["depth_agreement_reason"]
+    pictures = sorted((job.stage("assess") / "images").iterdir())
+    assert len(pictures) == 2
+    with Image.open(pictures[0]) as opened:
+        assert opened.size == (3 * 36, 64)
+
+
+@pytest.mark.parametrize(
+    ("factor", "expected"), [(1.0, "agrees"), (0.9, "behind"), (1.1, "before")]
+)
+def test_the_mesh_is_compared_with_depth_that_views_agree_on(
+    job: Workspace, factor: float, expected: str
+) -> None:
+    _exact_assets(job)
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    writer = DepthMapsWriter(job.stage("depth"))
+    for image in cameras.images[::3]:
+        lens = cameras.cameras[image.camera]
+        z = (factor * depth_image(lens, pose_matrix(image))).astype(np.float32)
+        writer.append(image.file, Pinhole.of(lens, 64), DepthMap(z, np.ones(z.shape, np.uint8)))
+    writer.close()
+    _publish(job, "depth")
+    found = tiny_job.run(job, "assess", long_side_px=64)["summary"]["depth_agreement"]
+    assert found[expected] > 0.8
+    assert found["agrees"] + found["before"] + found["behind"] + found["missing"] == pytest.approx(
+        1.0, abs=1e-3
+    )
+    assert found["num_pixels"] > 6 * 36 * 64
+
+
+def test_the_photos_are_the_held_out_ones(job: Workspace) -> None:
+    _exact_assets(job)
+    assets = tiny_job.run(job, "assess", num_views=3)["summary"]
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    split = {image.file: image.split for image in cameras.images}
+    assert [split[row["file"]] for row in assets["per_view"]] == ["test"] * 3
+
+
+def test_without_held_out_photos_training_ones_are_taken_and_it_is_said(job: Workspace) -> None:
+    _exact_assets(job)
+    path = job.stage("train") / "cameras.json"
+    cameras = CamerasFile.load(path)
+    replace(cameras, images=tuple(replace(i, split="train") for i in cameras.images)).save(path)
+    assets = tiny_job.run(job, "assess", num_views=4)["summary"]
+    assert assets["views"]["held_out"] is False
+    assert assets["views"]["num_views"] == 4
+    assert "trained on" in assets["views"]["note"]
+
+
+def test_a_mesh_of_islands_is_warned_of_and_by_option_refused(job: Workspace) -> None:
+    _exact_assets(job, keep=0.08, floaters=0.12)
+    assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    (warning,) = assets["warnings"]
+    assert warning["code"] == "geometry_poor"
+    assert warning["hint"]
+    assert assets["mesh"]["coverage"] < 0.5
+    assert assets["depth_inconsistency"] == 0.12
+    with pytest.raises(ExportError, match="do not hold together") as raised:
+        tiny_job.run(job, "assess", long_side_px=64, require_geometry=True)
+    assert raised.value.code == "geometry_poor"
+    lenient = {"min_coverage": 0.0, "max_depth_inconsistency": 1.0, "require_geometry": True}
+    assert tiny_job.run(job, "assess", long_side_px=64, **lenient)["summary"]["warnings"] == []
+
+
+def test_floaters_that_were_not_measured_leave_coverage_to_judge(job: Workspace) -> None:
+    _exact_assets(job, floaters=None)
+    assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert assets["depth_inconsistency"] is None
+    assert assets["warnings"] == []
+
+
+def _with_depth(job: Workspace, unit: float) -> None:
+    """Give every image exact depth in 16 bits."""
+    path = job.stage("train") / "cameras.json"
+    cameras = CamerasFile.load(path)
+    (job.images_root / "depth").mkdir()
+    images = []
+    for number, image in enumerate(cameras.images):
+        depth = depth_image(cameras.cameras[0], pose_matrix(image))
+        file = f"depth/{number:05d}.png"
+        Image.fromarray(np.rint(depth / unit).astype(np.uint16)).save(job.images_root / file)
+        images.append(replace(image, depth=file))
+    notes = {**cameras.notes, DEPTH_UNIT_NOTE: unit}
+    replace(cameras, images=tuple(images), notes=notes).save(path)
+
+
+def test_the_mesh_is_compared_with_the_captures_own_depth(job: Workspace) -> None:
+    _exact_assets(job)
+    _with_depth(job, unit=0.0005)
+    assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert assets["depth_reason"] is None
+    depth = assets["depth"]
+    assert depth["scale"] == 1.0
+    assert depth["median_relative_error"] < 0.01
+    assert depth["within_5_percent"] > 0.97
+    assert depth["covered_and_within_5_percent"] == pytest.approx(
+        depth["coverage"] * depth["within_5_percent"], abs=1e-3
+    )
+
+
+def test_a_damaged_depth_picture_costs_the_comparison_and_not_the_job(job: Workspace) -> None:
+    _exact_assets(job)
+    _with_depth(job, unit=0.001)
+    for path in (job.images_root / "depth").iterdir():
+        path.write_bytes(b"no picture")
+    assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert assets["depth"] is None
+    assert "no depth picture" in assets["depth_reason"]
+
+
+def test_a_mask_leaves_its_pixels_out(job: Workspace) -> None:
+    _exact_assets(job, keep=0.5)
+    before = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    mask = np.zeros((64, 36), np.uint8)
+    mask[:, :10] = 255
+    Image.fromarray(mask).save(job.images_root / "mask.png")
+    path = job.stage("train") / "cameras.json"
+    cameras = CamerasFile.load(path)
+    replace(cameras, images=tuple(replace(i, mask="mask.png") for i in cameras.images)).save(path)
+    after = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert after["mesh"]["coverage"] != before["mesh"]["coverage"]
+    assert after["mesh"]["psnr_with_holes"] != before["mesh"]["psnr_with_holes"]

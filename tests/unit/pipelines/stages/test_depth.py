@@ -1,0 +1,140 @@
+"""The stages `depth` and `draft` on a tiny capture with exact poses and truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.errors import Cancelled, TrainingError
+from pipelines.manifest import RunHooks
+from pipelines.options import OptionsError, resolve_options
+from pipelines.sample.scene import depth_image, pose_matrix
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.depth_maps_file import INDEX, DepthMapsFile
+from pipelines.scene.depth_views import Pinhole
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.stages import tiny_job
+
+STEREO = {"long_side_px": 64, "num_planes": 64, "window_radius": 2}
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A capture whose `depth` is complete."""
+    workspace = tiny_job.make_capture(tmp_path_factory.mktemp("mapped") / "job", num_images=24)
+    tiny_job.run(workspace, "depth", **STEREO)
+    return workspace
+
+
+def test_maps_are_those_of_the_training_images_and_right(mapped: Workspace) -> None:
+    capture = CamerasFile.load(mapped.stage("ingest") / "cameras.json")
+    truth = {image.file: image for image in capture.images}
+    maps = DepthMapsFile(mapped.stage("depth"))
+    files = [image.file for image in maps.images]
+    assert len(files) == 19
+    assert len(set(files)) == 19
+    errors, shares = [], []
+    for held, found in maps:
+        image = truth[held.file]
+        exact = depth_image(capture.cameras[image.camera], pose_matrix(image))
+        assert held.lens == Pinhole.of(capture.cameras[image.camera], 64)
+        known = found.z > 0
+        errors.append(np.abs(found.z[known] / exact[known] - 1.0))
+        shares.append(known.mean())
+        assert (found.votes[known] >= 2).all()
+    assert np.mean(shares) > 0.3
+    assert np.median(np.concatenate(errors)) < 0.02
+    assert (np.concatenate(errors) < 0.05).mean() > 0.8
+
+
+def test_what_is_held_out_takes_no_part(mapped: Workspace, tmp_path: Path) -> None:
+    """A held-out picture of noise changes no map; a training picture does."""
+    options = tiny_job.options_of("depth", **STEREO)
+    assert options["held_out"]["eval_fraction"] == 0.1
+    names = {image.file for image in DepthMapsFile(mapped.stage("depth")).images}
+    before = _all_depths(mapped)
+    for held_out in (True, False):
+        workspace = tiny_job.make_capture(tmp_path / str(held_out), num_images=24)
+        images = CamerasFile.load(workspace.stage("ingest") / "cameras.json").images
+        spoiled = next(image.file for image in images if (image.file in names) != held_out)
+        noise = np.random.default_rng(0).integers(0, 255, (64, 36, 3)).astype(np.uint8)
+        Image.fromarray(noise).save(workspace.stage("ingest") / spoiled)
+        tiny_job.run(workspace, "depth", **STEREO)
+        same = [np.array_equal(a, b) for a, b in zip(before, _all_depths(workspace), strict=True)]
+        assert all(same) == held_out
+
+
+def _all_depths(workspace: Workspace) -> list[np.ndarray]:
+    return [found.z for _, found in DepthMapsFile(workspace.stage("depth"))]
+
+
+def test_what_is_held_out_is_said_once() -> None:
+    resolved = resolve_options("preview", {"train": {"data": {"eval_mode": "interval"}}})
+    assert resolved["depth"]["held_out"]["eval_mode"] == "interval"
+    assert resolve_options("preview", resolved) == resolved, "a job's options make the same job"
+    with pytest.raises(OptionsError, match=r"as in train\.data"):
+        resolve_options("preview", {"depth": {"held_out": {"eval_mode": "none"}}})
+
+
+def test_the_report_says_how_much_is_known(mapped: Workspace) -> None:
+    report = json.loads((mapped.stage("depth") / "report.json").read_text("utf-8"))
+    assert report == mapped.manifest("depth")["summary"]
+    assert report["num_maps"] == 19
+    assert 0.0 <= report["least_known_share"] <= report["known_share"] <= 1.0
+    assert report["mean_votes"] >= 2.0
+    with Image.open(mapped.stage("depth") / "depth.jpg") as picture:
+        assert picture.size == (6 * (36 + 4), 2 * 64)
+
+
+def test_the_draft_is_a_mesh_where_the_scene_is(mapped: Workspace) -> None:
+    summary = tiny_job.run(mapped, "draft", resolution=64)["summary"]
+    assert summary["num_faces"] > 500
+    assert (mapped.stage("draft") / "draft.glb").read_bytes()[:4] == b"glTF"
+    with Image.open(mapped.stage("draft") / "draft.jpg") as picture:
+        shown = np.asarray(picture.convert("RGB")).astype(int)
+    assert (np.abs(shown - 128).max(axis=-1) > 8).mean() > 0.2, "a picture of nothing"
+    assert summary["num_views"] == 19
+
+
+def test_without_maps_there_is_no_draft_and_training_goes_on(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=8)
+    assert tiny_job.run(workspace, "depth", source="off")["summary"]["num_maps"] == 0
+    drafted = tiny_job.run(workspace, "draft")
+    assert drafted["summary"] == {"num_faces": 0, "why": "there are no depth maps"}
+    assert "depth" not in tiny_job.run(workspace, "train", max_steps=2)["summary"]["losses"]
+
+
+def test_training_learns_from_the_maps_unless_told_not_to(mapped: Workspace) -> None:
+    learned = tiny_job.run(mapped, "train", max_steps=3)["summary"]
+    assert learned["losses"]["depth"] > 0.0
+    unused = tiny_job.run(mapped, "train", max_steps=3, depth={"weight": 0.0})["summary"]
+    assert "depth" not in unused["losses"]
+
+
+def test_maps_that_know_held_out_images_are_refused(mapped: Workspace) -> None:
+    with pytest.raises(TrainingError, match="not those of the images") as caught:
+        tiny_job.run(mapped, "train", max_steps=2, data={"eval_mode": "interval"})
+    assert caught.value.code == "depth_maps_outdated"
+
+
+def test_a_cancel_ends_the_search_between_two_views(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=12)
+    messages: list[str] = []
+    hooks = RunHooks(
+        on_progress=lambda fraction, message, eta_s: messages.append(message),
+        is_cancelled=lambda: any(message.startswith("depth 2/") for message in messages),
+    )
+    with pytest.raises(Cancelled):
+        tiny_job.run_with(workspace, "depth", hooks, **STEREO)
+    assert messages[-1].startswith("depth 2/")
+    assert not workspace.stage("depth").exists()
+
+
+def test_a_list_of_maps_that_makes_no_sense_is_named(tmp_path: Path) -> None:
+    (tmp_path / INDEX).write_text('{"images": [{"file": "a.jpg"}]}', "utf-8")
+    with pytest.raises(ValueError, match=r"maps\.json is no list of depth maps"):
+        DepthMapsFile(tmp_path)
