@@ -15,9 +15,9 @@ from tests.samples import sample_clip
 
 
 @contextmanager
-def running(home: Path) -> Iterator[tuple[Client, Embedded, Supervisor]]:
+def running(home: Path, cache: Path) -> Iterator[tuple[Client, Embedded, Supervisor]]:
     """The embedded service on a free port, stopped at the end whatever happens."""
-    embedded = Embedded.at(home, "127.0.0.1", free_port(), home.parent / "cache")
+    embedded = Embedded.at(home, "127.0.0.1", free_port(), cache)
     supervisor = embedded.supervisor(print)
     supervisor.start()
     try:
@@ -33,8 +33,14 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return sample_clip(tmp_path_factory.mktemp("sample"))
 
 
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Empty at first: the first job compiles its kernels, those after it find them there."""
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture
-def service(tmp_path: Path) -> Iterator[tuple[Client, Embedded, Supervisor]]:
+def service(tmp_path: Path, cache: Path) -> Iterator[tuple[Client, Embedded, Supervisor]]:
     """A fresh embedded service."""
-    with running(tmp_path / "home") as parts:
+    with running(tmp_path / "home", cache) as parts:
         yield parts

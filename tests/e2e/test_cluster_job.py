@@ -11,10 +11,11 @@ import pytest
 from api.client import Client
 from deploy.embedded import Embedded, free_port
 from tests.capture_writers import write_polycam
+from tests.e2e.waiting import succeeded
 from tests.samples import SMALL
 from tests.services import RedisServer, S3Endpoint
 
-pytestmark = [pytest.mark.services, pytest.mark.slow]
+pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 
 
 def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
@@ -22,6 +23,7 @@ def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
     s3_endpoint: S3Endpoint,
     redis_server: RedisServer,
     tmp_path: Path,
+    cache: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name, value in {
@@ -34,7 +36,7 @@ def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
     write_polycam(archive, num=40)
     options: dict[str, Any] = {name: SMALL[name] for name in SMALL if name != "poses"}
 
-    embedded = Embedded.at(tmp_path / "home", "127.0.0.1", free_port(), tmp_path / "cache")
+    embedded = Embedded.at(tmp_path / "home", "127.0.0.1", free_port(), cache)
     supervisor = embedded.supervisor(print)
     assert [program.name for program in supervisor.programs] == ["api", "worker"]
     supervisor.start()
@@ -43,8 +45,7 @@ def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
             capture = client.upload(archive)
             assert capture.kind == "polycam"
             job = client.create_job(capture.id, preset="preview", options=options)
-            job = client.wait(job.id, timeout=400)
-            assert job.state == "succeeded", job.error
+            job = succeeded(client, embedded, job.id, 540)
             states = {stage.name: stage.state for stage in job.stages}
             assert states["frames"] == states["poses"] == "skipped"
             for artifact in client.artifacts(job.id):

@@ -19,9 +19,10 @@ from pipelines.sample.film import phone_camera, render_all, walk
 from pipelines.sample.judge import judge_mesh, judge_poses
 from pipelines.scene.cameras_file import CamerasFile
 from tests.capture_writers import write_hdr_hevc
+from tests.e2e.waiting import succeeded
 from tests.samples import SMALL
 
-pytestmark = [pytest.mark.services, pytest.mark.slow]
+pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 
 BRIEF = {
     "frames": {"num_frames": 32},
@@ -49,12 +50,11 @@ REPORT_KEYS = (
 def test_video_over_http_comes_back_as_assets_true_to_the_scene(
     service: tuple[Client, Embedded, Supervisor], clip: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    client, _, _ = service
+    client, embedded, _ = service
     capture = client.upload(clip[0])
     assert capture.kind == "video"
     job = client.create_job(capture.id, preset="preview", options=SMALL)
-    job = client.wait(job.id, timeout=540)
-    assert job.state == "succeeded", job.error
+    job = succeeded(client, embedded, job.id, 540)
 
     out = tmp_path / "out"
     client.download(job.id, out)
@@ -84,14 +84,13 @@ def test_video_over_http_comes_back_as_assets_true_to_the_scene(
 def test_hdr_rotated_hevc_clip_goes_through(
     service: tuple[Client, Embedded, Supervisor], tmp_path: Path
 ) -> None:
-    client, _, _ = service
+    client, embedded, _ = service
     clip = tmp_path / "IMG_0001.MOV"
     truth = write_hdr_hevc(clip, num=60, long_side_px=640)
     capture = client.upload(clip)
     assert capture.kind == "video"
     job = client.create_job(capture.id, preset="preview", options=merge(SMALL, BRIEF))
-    job = client.wait(job.id, timeout=400)
-    assert job.state == "succeeded", job.error
+    job = succeeded(client, embedded, job.id, 540)
 
     out = tmp_path / "out"
     client.download(job.id, out)

@@ -22,8 +22,9 @@ from api.client import Client, Job
 from deploy.embedded import Embedded
 from deploy.supervisor import Supervisor
 from tests.capture_writers import write_nerfstudio
+from tests.e2e.waiting import succeeded
 
-pytestmark = [pytest.mark.services, pytest.mark.slow]
+pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 
 TINY: dict[str, Any] = {
     "depth": {"long_side_px": 96, "num_planes": 32},
@@ -110,8 +111,7 @@ def test_job_succeeds_though_every_process_is_killed(
         os.kill(pid, signal.SIGKILL)
         until(lambda: supervisor.pids()[name] != pid, 5, f"{name} was started again")  # noqa: B023
 
-    job = client.wait(job.id, timeout=400)
-    assert job.state == "succeeded", job.error
+    job = succeeded(client, embedded, job.id, 540)
     runs = finished_runs(embedded, job.id)
     assert set(runs.values()) == {1}, runs
     log = "\n".join(client.logs(job.id, stage="train"))

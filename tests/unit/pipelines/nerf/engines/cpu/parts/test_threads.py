@@ -64,7 +64,7 @@ def used():
 @compiled
 def spin(share, shares, out):
     total = 0.0
-    for index in range(30_000_000):
+    for index in range(300_000_000):
         total += 1.0 / (index + share + 1)
     out[share] = total
 
