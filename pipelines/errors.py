@@ -76,14 +76,14 @@ class PosesError(PipelineError):
 
 class TrainingError(PipelineError):
     """Training cannot go on. Codes in use: non_finite_loss, too_few_images, out_of_memory,
-    depth_maps_outdated."""
+    depth_maps_outdated, no_sensor_depth."""
 
     code = "training_failed"
 
 
 class ExportError(PipelineError):
-    """The trained model gives no asset. Codes in use: empty_mesh, empty_pointcloud,
-    geometry_poor, no_focus."""
+    """The trained model, or the depth maps, give no asset. Codes in use: empty_mesh,
+    empty_pointcloud, geometry_poor, no_focus."""
 
     code = "export_failed"
 

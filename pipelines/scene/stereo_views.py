@@ -1,4 +1,4 @@
-"""The pictures of a capture as stereo wants them: undistorted, grey, small."""
+"""The pictures of a capture as stereo wants them, undistorted, grey, small; and their depths."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from PIL import Image
 from pipelines.nerf.space.lenses import CAMERA_MODELS, distort
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.scene.depth_sampling import sampled
 from pipelines.scene.depth_views import Pinhole
 
 _OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
@@ -54,26 +55,30 @@ def undistorted_picture(
     return shown
 
 
+def sensor_depth(
+    root: Path, image: PosedImage, lens: Intrinsics, pinhole: Pinhole
+) -> NDArray[np.float32] | None:
+    """What the capture's depth sensor saw, as that pinhole has it: [H, W] along the axis, world
+    units, 0 where unknown. None for an image without depth.
+    """
+    if image.depth is None:
+        return None
+    with np.load(root / image.depth, allow_pickle=False) as held:
+        z = held["z"].astype(np.float32)
+    height, width = z.shape
+    u, v = _image_pixels(lens, pinhole)
+    return sampled(z, u * (width / lens.width) - 0.5, v * (height / lens.height) - 0.5)
+
+
 def _undistorted(
     picture: NDArray[np.float32], lens: Intrinsics, pinhole: Pinhole
 ) -> NDArray[np.float32]:
     """The picture [H, W] as the pinhole would show it; negative where it has nothing."""
-    terms = (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2)
-    if lens.model == "PINHOLE" or (lens.model == "OPENCV" and not any(terms)):
+    if not _is_distorted(lens):
         return picture
     height, width = picture.shape
-    directions = torch.from_numpy(pinhole.directions() * np.array([1.0, -1.0, -1.0]))
-    model = CAMERA_MODELS.index(lens.model)
-    flat = directions.reshape(-1, 3)
-    plane = distort(
-        flat,
-        torch.tensor([terms], dtype=torch.float64).expand(len(flat), -1),
-        torch.full((len(flat),), model),
-        (model,),
-    )
-    sx, sy = width / lens.width, height / lens.height
-    u = (plane[:, 0].numpy() * lens.fl_x + lens.cx) * sx - 0.5
-    v = (plane[:, 1].numpy() * lens.fl_y + lens.cy) * sy - 0.5
+    u, v = _image_pixels(lens, pinhole)
+    u, v = u * (width / lens.width) - 0.5, v * (height / lens.height) - 0.5
     inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     i = np.clip(u.astype(int), 0, width - 2)
     j = np.clip(v.astype(int), 0, height - 2)
@@ -83,4 +88,26 @@ def _undistorted(
     bottom = corners[2] + fu * (corners[3] - corners[2])
     usable = inside & (np.minimum.reduce(corners) >= 0.0)
     values = np.where(usable, top + fv * (bottom - top), -1.0)
-    return values.reshape(height, width).astype(np.float32)
+    return values.astype(np.float32)
+
+
+def _is_distorted(lens: Intrinsics) -> bool:
+    return lens.model != "PINHOLE" and not (lens.model == "OPENCV" and not any(_terms(lens)))
+
+
+def _terms(lens: Intrinsics) -> tuple[float, ...]:
+    return (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2)
+
+
+def _image_pixels(
+    lens: Intrinsics, pinhole: Pinhole
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where in the stored image each of the pinhole's pixels is: u and v, [H, W] each, px."""
+    plane = pinhole.directions()[..., :2] * np.array([1.0, -1.0])
+    if _is_distorted(lens):
+        flat = torch.from_numpy(pinhole.directions() * np.array([1.0, -1.0, -1.0])).reshape(-1, 3)
+        model = CAMERA_MODELS.index(lens.model)
+        terms = torch.tensor([_terms(lens)], dtype=torch.float64).expand(len(flat), -1)
+        bent = distort(flat, terms, torch.full((len(flat),), model), (model,))
+        plane = bent.numpy().reshape(plane.shape)
+    return plane[..., 0] * lens.fl_x + lens.cx, plane[..., 1] * lens.fl_y + lens.cy

@@ -1,9 +1,10 @@
-"""The depth stage: where surfaces are, from the pictures alone, before anything is trained.
+"""The depth stage: where surfaces are, from pictures and sensor, before anything is trained.
 
-Reads `cameras.json` of `poses` or `ingest`, the images beside it, and the points of structure from
-motion where there are any. Writes a depth map for each image that will be trained on, agreed upon
-by its neighbours (`maps.json`, `maps/`), and `depth.jpg` to look at. Held-out images take no part:
-what they judge must not be made from them.
+Reads `cameras.json` of `poses` or `ingest`, the images beside it, the depth that the capture
+brings, and the points of structure from motion where there are any. Writes a depth map for each
+image that will be trained on, agreed upon by its neighbours (`maps.json`, `maps/`), and `depth.jpg`
+to look at. Held-out images take no part, nor does their depth: what they judge must not be made
+from them.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ from pipelines.nerf.data.images import split_indices
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, config_from_dict
-from pipelines.nerf.stereo.maps import DepthMap, find_depth_maps
+from pipelines.nerf.stereo.maps import DepthMap, Progress, find_depth_maps
+from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_points, sensor_scale
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.option_models import StageOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.natural_order import natural_key
-from pipelines.scene.stereo_views import stereo_view
+from pipelines.scene.stereo_views import sensor_depth, stereo_view
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 
@@ -56,10 +58,19 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         return {"source": source, "num_maps": 0}
     started = time.monotonic()
     capture, images = training_images(ctx, split)
-    lenses = [capture.cameras[image.camera] for image in images]
-    views = []
-    for index, (image, lens) in enumerate(zip(images, lenses, strict=True)):
-        views.append(stereo_view(ctx.workspace.images_root, image, lens, config.long_side_px))
+    with_sensor = source in ("auto", "sensor") and any(image.depth for image in images)
+    if source == "sensor" and not with_sensor:
+        raise TrainingError(
+            "The capture brings no depth, and depth.source is sensor.",
+            code="no_sensor_depth",
+            hint="Set depth.source to auto or stereo.",
+        )
+    views: list[StereoView] = []
+    sensed: list[NDArray[np.float32] | None] = []
+    for index, image in enumerate(images):
+        lens, root = capture.cameras[image.camera], ctx.workspace.images_root
+        views.append(stereo_view(root, image, lens, config.long_side_px))
+        sensed.append(sensor_depth(root, image, lens, _pinhole(views[-1])) if with_sensor else None)
         ctx.progress(_LOAD_SHARE * (index + 1) / len(images), "loading images")
 
     def on_progress(fraction: float, message: str) -> None:
@@ -67,15 +78,54 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         spent = time.monotonic() - started
         ctx.progress(share, message, spent * (1.0 - share) / share if share > 0.1 else None)
 
-    maps = find_depth_maps(views, config, _known_points(ctx), on_progress)
+    summary: dict[str, Any] = {"source": "stereo", "num_maps": len(images)}
+    if with_sensor:
+        maps, told = _with_sensor(ctx, views, sensed, config, source, on_progress)
+        summary |= told
+    else:
+        maps = find_depth_maps(views, config, _known_points(ctx), on_progress)
     for image, view, found in zip(images, views, maps, strict=True):
         ctx.check_cancelled()
         writer.append(image.file, _pinhole(view), found)
     writer.close()
     _save_picture(ctx.out / "depth.jpg", views, maps)
-    summary = {"source": source, "num_maps": len(maps), **_described(maps)}
+    summary |= _described(maps)
     (ctx.out / "report.json").write_text(json.dumps(summary, indent=1), "utf-8")
     return summary
+
+
+def _with_sensor(
+    ctx: StageContext,
+    views: list[StereoView],
+    sensed: list[NDArray[np.float32] | None],
+    config: StereoConfig,
+    source: str,
+    on_progress: Progress,
+) -> tuple[list[DepthMap], dict[str, Any]]:
+    """Maps from the sensor, and from stereo too unless it is all that is wanted; and what of it."""
+    told: dict[str, Any] = {
+        "source": "sensor",
+        "num_sensor_maps": sum(z is not None for z in sensed),
+    }
+    if source == "sensor":
+        return sensor_maps(views, sensed, config), told
+    points = _known_points(ctx)
+    points = sensor_points(views, sensed) if points is None else points
+    stereo = find_depth_maps(views, config, points, on_progress)
+    scale = sensor_scale(stereo, sensed)
+    if scale.factor != 1.0:
+        ctx.logger.warning(
+            "The sensor's depths are multiplied by %.4g to fit the camera poses", scale.factor
+        )
+        sensed = [None if z is None else z * np.float32(scale.factor) for z in sensed]
+    told |= {
+        "source": "stereo and sensor",
+        "sensor_scale": round(scale.factor, 6),
+        "sensor_scale_spread": None if scale.spread is None else round(scale.spread, 5),
+    }
+    measured = sensor_maps(views, sensed, config)
+    both = zip(stereo, measured, strict=True)
+    return [merged(a, b, config.agree_within) for a, b in both], told
 
 
 def training_images(ctx: StageContext, split: SplitConfig) -> tuple[CamerasFile, list[PosedImage]]:

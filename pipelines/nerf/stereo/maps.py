@@ -59,7 +59,7 @@ def find_depth_maps(
     if points is None or len(points) < _MAX_POINTS // 100:
         points = find_points(views, config, lambda f, text: on_progress(_PROBE_SHARE * f, text))
         begun = _PROBE_SHARE
-    points = _thinned(points)
+    points = thinned(points)
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
     ranges = [depth_range(view, points) for view in views]
     known = [item for item in ranges if item is not None]
@@ -113,7 +113,8 @@ def back_project(view: StereoView, z: NDArray[np.float32]) -> Floats:
     return world
 
 
-def _thinned(points: Floats) -> Floats:
+def thinned(points: Floats) -> Floats:
+    """At most 4,000 of the points [P, 3], evenly picked."""
     if len(points) <= _MAX_POINTS:
         return points
     thinned: Floats = points[np.linspace(0, len(points) - 1, _MAX_POINTS).astype(int)]

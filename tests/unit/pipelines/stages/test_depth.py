@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -119,6 +120,72 @@ def test_maps_that_know_held_out_images_are_refused(mapped: Workspace) -> None:
     with pytest.raises(TrainingError, match="not those of the images") as caught:
         tiny_job.run(mapped, "train", max_steps=2, data={"eval_mode": "interval"})
     assert caught.value.code == "depth_maps_outdated"
+
+
+def with_depth(workspace: Workspace, factor: float = 1.0) -> None:
+    """Give every image of the capture its exact depth, at half its size, times a factor."""
+    folder = workspace.stage("ingest")
+    (folder / "depth").mkdir()
+    capture = CamerasFile.load(folder / "cameras.json")
+    images = []
+    for index, image in enumerate(capture.images):
+        lens = Pinhole.of(capture.cameras[image.camera], 32).intrinsics()
+        z = depth_image(lens, pose_matrix(image)) * factor
+        name = f"depth/{index + 1:05d}.npz"
+        np.savez_compressed(folder / name, z=z.astype(np.float32))
+        images.append(dataclasses.replace(image, depth=name))
+    dataclasses.replace(capture, images=tuple(images)).save(folder / "cameras.json")
+
+
+def how_right(workspace: Workspace) -> tuple[float, float]:
+    """Share of the pixels that are known, and of these within 5 %."""
+    capture = CamerasFile.load(workspace.stage("ingest") / "cameras.json")
+    truth = {image.file: image for image in capture.images}
+    known, right = [], []
+    for held, found in DepthMapsFile(workspace.stage("depth")):
+        image = truth[held.file]
+        exact = depth_image(capture.cameras[image.camera], pose_matrix(image))
+        known.append(found.z > 0)
+        right.append(np.abs(found.z / exact - 1.0) < 0.05)
+    return float(np.mean(known)), float(np.stack(right)[np.stack(known)].mean())
+
+
+@pytest.mark.parametrize("source", ["auto", "sensor"])
+def test_the_depth_that_a_capture_brings_fills_the_maps(
+    mapped: Workspace, tmp_path: Path, source: str
+) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=24)
+    with_depth(workspace)
+    summary = tiny_job.run(workspace, "depth", source=source, **STEREO)["summary"]
+    assert summary["source"] == {"auto": "stereo and sensor", "sensor": "sensor"}[source]
+    assert summary["num_sensor_maps"] == summary["num_maps"] == 19
+    known, right = how_right(workspace)
+    known_before, right_before = how_right(mapped)
+    assert known > known_before + 0.2
+    assert right > max(right_before, 0.95)
+
+
+def test_a_sensor_in_another_unit_is_scaled_and_told(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=24)
+    with_depth(workspace, factor=1.2)
+    summary = tiny_job.run(workspace, "depth", **STEREO)["summary"]
+    assert summary["sensor_scale"] == pytest.approx(1.0 / 1.2, rel=0.02)
+    assert how_right(workspace)[1] > 0.95
+
+
+def test_stereo_alone_does_not_look_at_the_sensor(mapped: Workspace, tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=24)
+    with_depth(workspace)
+    tiny_job.run(workspace, "depth", source="stereo", **STEREO)
+    both = zip(_all_depths(mapped), _all_depths(workspace), strict=True)
+    assert all(np.array_equal(a, b) for a, b in both)
+
+
+def test_a_sensor_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=8)
+    with pytest.raises(TrainingError, match="brings no depth") as caught:
+        tiny_job.run(workspace, "depth", source="sensor")
+    assert caught.value.code == "no_sensor_depth"
 
 
 def test_a_cancel_ends_the_search_between_two_views(tmp_path: Path) -> None:

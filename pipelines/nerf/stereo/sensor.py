@@ -1,0 +1,96 @@
+"""Depth of a sensor beside that of stereo: brought to one scale, cross-examined, merged.
+
+A sensor knows plain surfaces, which stereo cannot match, and smears edges; stereo is the finer one
+where there is texture. Maps are [H, W] along the camera's axis, world units, 0 where unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.maps import DepthMap, agreed, back_project, thinned
+from pipelines.nerf.stereo.neighbours import choose_neighbours
+from pipelines.nerf.stereo.views import StereoView
+
+Depths = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+_MIN_AGREEING = 1
+"""A sensor measures, stereo guesses: one other view is enough, where not more see through."""
+_MIN_SHARED = 1000
+_MOST_SPREAD = 0.05
+_SAME_SCALE = 0.01
+
+
+@dataclass(frozen=True)
+class SensorScale:
+    """What a sensor's depths must be multiplied by to be in the cameras' unit.
+
+    factor: 1 where they are, or where too little tells. spread: half the distance of the quartiles
+    of depth ratios, relative; None where both know less than 1,000 pixels in common.
+    """
+
+    factor: float
+    spread: float | None
+
+
+def sensor_scale(stereo: Sequence[DepthMap], sensed: Sequence[Depths | None]) -> SensorScale:
+    """Compare the maps of both where both know a pixel.
+
+    Only ratios that hold together count (spread up to 5 %), and only beyond 1 %.
+    """
+    ratios = [
+        np.log(found.z[both] / z[both])
+        for found, z in zip(stereo, sensed, strict=True)
+        if z is not None and (both := (found.z > 0) & (z > 0)).any()
+    ]
+    if sum(len(item) for item in ratios) < _MIN_SHARED:
+        return SensorScale(1.0, None)
+    low, middle, high = np.percentile(np.concatenate(ratios), (25.0, 50.0, 75.0))
+    spread = float(high - low) / 2.0
+    trusted = spread <= _MOST_SPREAD and abs(middle) > _SAME_SCALE
+    return SensorScale(float(np.exp(middle)) if trusted else 1.0, spread)
+
+
+def sensor_points(views: Sequence[StereoView], sensed: Sequence[Depths | None]) -> Floats:
+    """Some points [P, 3] on what the sensor saw, world."""
+    found = [
+        thinned(back_project(view, z))
+        for view, z in zip(views, sensed, strict=True)
+        if z is not None
+    ]
+    return thinned(np.concatenate(found)) if found else np.zeros((0, 3))
+
+
+def sensor_maps(
+    views: Sequence[StereoView], sensed: Sequence[Depths | None], config: StereoConfig
+) -> list[DepthMap]:
+    """The sensor's maps without what other views' sensors contradict; averaged where they agree."""
+    config = replace(config, min_agreeing=_MIN_AGREEING)
+    points = sensor_points(views, sensed)
+    neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
+    maps = [
+        np.zeros(view.picture.shape, np.float32) if z is None else z
+        for view, z in zip(views, sensed, strict=True)
+    ]
+    return [agreed(index, views, maps, neighbours[index], config) for index in range(len(views))]
+
+
+def merged(stereo: DepthMap, sensor: DepthMap, within: float) -> DepthMap:
+    """The sensor's depths; stereo's where the sensor knows nothing or both agree.
+
+    within: relative difference up to which they do.
+    """
+    both = (stereo.z > 0) & (sensor.z > 0)
+    agree = both & (np.abs(stereo.z - sensor.z) <= within * sensor.z)
+    by_stereo = (stereo.z > 0) & (agree | ~both)
+    votes = np.where(by_stereo, stereo.votes, sensor.votes)
+    return DepthMap(
+        np.where(by_stereo, stereo.z, sensor.z),
+        np.where(agree, np.maximum(stereo.votes, sensor.votes), votes).astype(np.uint8),
+    )
