@@ -19,6 +19,7 @@ from pipelines.options import (
     resolve_options,
     train_options,
 )
+from pipelines.registry import STAGE_NAMES
 
 router = APIRouter(prefix="/v1", tags=["catalogue"])
 page_router = APIRouter(include_in_schema=False)
@@ -44,6 +45,9 @@ class PresetView(BaseModel):
     name: str
     summary: str
     options: dict[str, Any] = Field(description="The options of every stage.")
+    without: list[str] = Field(
+        description="Stages that its jobs skip; a capture may have no use for others."
+    )
 
 
 class PresetList(BaseModel):
@@ -58,7 +62,12 @@ class PresetList(BaseModel):
 def preset_views() -> tuple[PresetView, ...]:
     """All presets with their options resolved."""
     return tuple(
-        PresetView(name=name, summary=preset.summary, options=resolve_options(name, {}))
+        PresetView(
+            name=name,
+            summary=preset.summary,
+            options=resolve_options(name, {}),
+            without=[stage for stage in STAGE_NAMES if stage in preset.without],
+        )
         for name, preset in PRESETS.items()
     )
 

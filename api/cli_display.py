@@ -256,8 +256,8 @@ def asset_rows(assets: dict[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def quality_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
-    """(what, value) from a report: images registered, held-out quality, time per stage."""
-    poses, metrics = report.get("poses", {}), report.get("metrics", {})
+    """(what, value) from a report: images registered, quality, time per stage."""
+    poses = report.get("poses", {})
     rows = []
     if poses.get("num_images") is not None:
         ratio = poses.get("registered_ratio")
@@ -265,12 +265,8 @@ def quality_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             ("images registered", f"{poses['num_registered']} of {poses['num_images']}{share}")
         )
-    held = metrics.get("num_images") or 0
-    rows.append(("held-out images", str(held)))
-    if metrics.get("width"):
-        rows[-1] = (rows[-1][0], f"{held}, {metrics['width']} x {metrics['height']} px")
-    rows.append(("held-out PSNR", _number(metrics.get("psnr"), ".2f", " dB")))
-    rows.append(("held-out SSIM", _number(metrics.get("ssim"), ".3f")))
+    metrics = report.get("metrics", {})
+    rows += _draft_rows(report) if metrics is None else _held_out_rows(metrics)
     rows += asset_rows(report.get("assets"))
     timings = report.get("timings", {})
     rows += [
@@ -279,6 +275,26 @@ def quality_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         if seconds is not None
     ]
     return rows
+
+
+def _held_out_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    held = str(metrics.get("num_images") or 0)
+    if metrics.get("width"):
+        held += f", {metrics['width']} x {metrics['height']} px"
+    return [
+        ("held-out images", held),
+        ("held-out PSNR", _number(metrics.get("psnr"), ".2f", " dB")),
+        ("held-out SSIM", _number(metrics.get("ssim"), ".3f")),
+    ]
+
+
+def _draft_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """What a job that trained nothing has in place of held-out numbers."""
+    faces = report.get("stages", {}).get("draft", {}).get("num_faces")
+    return [
+        ("draft mesh", _number(faces, ",", " triangles")),
+        ("held-out quality", clean(str(report.get("metrics_reason") or "not measured"))),
+    ]
 
 
 def print_results(

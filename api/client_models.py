@@ -97,11 +97,12 @@ class Job(_Model):
 
 
 class Preset(_Model):
-    """A complete, named set of options."""
+    """A complete, named set of options. without: stages that its jobs skip."""
 
     name: str
     summary: str
     options: dict[str, Any]
+    without: list[str] = Field(default_factory=list)
 
 
 class Presets(_Model):
@@ -168,8 +169,10 @@ class WaitTimedOut(NerfworksError):
     """A job is not over yet; it goes on."""
 
     def __init__(self, job: Job, timeout_s: float) -> None:
+        stages = [f"{s.name} at {s.progress:.0%}" for s in job.stages if s.state == "running"]
+        at = f" ({', '.join(stages)})" if stages else ""
         super().__init__(
-            f"Job {job.id} is {job.state} after {timeout_s:.0f} s.", "It goes on; wait again."
+            f"Job {job.id} is {job.state}{at} after {timeout_s:.0f} s.", "It goes on; wait again."
         )
         self.job = job
 

@@ -62,6 +62,9 @@ def page() -> str:
     for preset in PRESETS.values():
         overrides = json.dumps(preset.overrides, indent=2)
         parts += [f"\nWhat `{preset.name}` changes:\n", "```json", overrides, "```"]
+        if preset.without:
+            left_out = ", ".join(f"`{name}`" for name in STAGE_OPTIONS if name in preset.without)
+            parts += [f"\nIts jobs skip {left_out}; options of these are refused."]
     for stage, model in STAGE_OPTIONS.items():
         schema = model.model_json_schema()
         parts += [f"\n## {stage}\n", (model.__doc__ or "").strip() + "\n"]

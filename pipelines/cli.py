@@ -114,8 +114,10 @@ def prepare_job(workspace: Workspace, source: Path | None, seed: int | None) -> 
     return job
 
 
-def _run_one(name: str, workspace: Workspace, options: dict[str, object], kind: str) -> None:
-    missing = missing_inputs(name, kind, workspace)
+def _run_one(
+    name: str, workspace: Workspace, options: dict[str, object], preset: str, kind: str
+) -> None:
+    missing = missing_inputs(name, preset, kind, workspace)
     if missing:
         raise PipelineError(
             f"{name} needs the results of {', '.join(missing)}, which are not there.",
@@ -155,7 +157,7 @@ def run(arguments: argparse.Namespace) -> int:
     job = prepare_job(workspace, arguments.input, arguments.seed)
     kind = str(job["kind"])
     if arguments.stage != ALL:
-        _run_one(arguments.stage, workspace, options[arguments.stage], kind)
+        _run_one(arguments.stage, workspace, options[arguments.stage], arguments.preset, kind)
         return 0
     started: list[str] = []
 

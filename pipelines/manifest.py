@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.errors import Cancelled, PipelineError, ResourceError
-from pipelines.options import resolve_options, stage_options
-from pipelines.registry import STAGES, get_stage, load_function, skipped_stages
+from pipelines.options import resolve_options, stage_options, stages_skipped
+from pipelines.registry import STAGES, get_stage, load_function
 from pipelines.stage import REPORT, ProgressSink, Stage, StageContext
 from pipelines.workspace import MANIFEST, Workspace
 
@@ -312,13 +312,14 @@ def run_job_locally(
 ) -> dict[str, dict[str, Any]]:
     """All stages in order on a local folder, those that are current left as they are.
 
-    kind: what `sniff` says of the capture; it decides which stages are skipped.
+    kind: what `sniff` says of the capture; it and the preset decide which stages are skipped.
+        What an earlier run left of those is removed.
     hooks_for: progress and cancel of each stage. on_reused: called for each that is current.
     until: stop after this stage.
     Returns the manifests by stage. Raises OptionsError, KeyError (preset), and what stages raise.
     """
     options = resolve_options(preset, dict(overrides))
-    skipped = skipped_stages(kind)
+    skipped = stages_skipped(preset, kind)
     manifests: dict[str, dict[str, Any]] = {}
     for stage in STAGES:
         values = options[stage.name]
@@ -336,9 +337,9 @@ def run_job_locally(
     return manifests
 
 
-def missing_inputs(stage_name: str, kind: str, workspace: Workspace) -> list[str]:
+def missing_inputs(stage_name: str, preset: str, kind: str, workspace: Workspace) -> list[str]:
     """Stages that must be run before this one and are not complete."""
-    skipped = skipped_stages(kind)
+    skipped = stages_skipped(preset, kind)
     return [
         name
         for name in get_stage(stage_name).reads

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError
 
 from pipelines.captures.minimum import MIN_IMAGES, MIN_POSED_IMAGES
-from pipelines.exports.catalogue import EXPORTS
+from pipelines.exports.catalogue import EXPORTS, KINDS
 from pipelines.exports.options import ExtentOptions
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.options.catalogue import find_method, methods
@@ -23,7 +23,7 @@ from pipelines.nerf.options.methods.nerfacto import NERFACTO
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, TrainConfig, config_from_dict, validate
 from pipelines.option_models import StageOptions, model_of
-from pipelines.registry import STAGE_NAMES
+from pipelines.registry import STAGE_NAMES, skipped_stages
 
 
 class IngestOptions(StageOptions):
@@ -126,10 +126,11 @@ class PosesOptions(StageOptions):
 class DepthOptions(model_of(StereoConfig)):  # type: ignore[misc]
     """Depth maps before training."""
 
-    source: Literal["stereo", "off"] = Field(
-        "stereo",
-        description="stereo compares each picture with its neighbours; off leaves training without "
-        "depth maps.",
+    source: Literal["auto", "stereo", "sensor", "off"] = Field(
+        "auto",
+        description="stereo compares each picture with its neighbours; sensor takes the depth that "
+        "the capture brings; auto is both where it brings some, else stereo; off leaves training "
+        "without depth maps.",
     )
     held_out: model_of(SplitConfig) = Field(  # type: ignore[valid-type]
         default_factory=lambda: dataclasses.asdict(SplitConfig()),
@@ -149,6 +150,11 @@ class DraftOptions(ExtentOptions):
     )
     max_faces: int = Field(
         100_000, ge=100, le=20_000_000, description="Simplified to this, as mesh.max_faces."
+    )
+    required: bool = Field(
+        False,
+        description="Fail the job with empty_mesh where the depth maps show no surface; without it "
+        "the job goes on, its mesh comes from training.",
     )
 
 
@@ -237,23 +243,49 @@ STAGE_OPTIONS: types.MappingProxyType[str, type[StageOptions]] = types.MappingPr
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """A complete set of options: what differs from the defaults, by stage."""
+    """A complete set of options, and the stages that are left out.
+
+    overrides: what differs from the defaults, by stage.
+    without: stages that its jobs skip. None of the others may need their results; `report` says
+    what there is.
+    """
 
     name: str
     summary: str
     overrides: dict[str, Any]
+    without: frozenset[str] = frozenset()
 
+
+_SMALL_PICTURES: dict[str, Any] = {
+    "frames": {"num_frames": 72, "long_side_px": 960},
+    "poses": {"max_image_px": 960, "num_features": 4096},
+}
 
 PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
     {
         preset.name: preset
         for preset in (
             Preset(
+                "draft",
+                "A mesh from depth maps alone, in a minute or two on a laptop: nothing is trained.",
+                {
+                    **_SMALL_PICTURES,
+                    "draft": {
+                        "resolution": 256,
+                        "num_views": 128,
+                        "max_faces": 200_000,
+                        "required": True,
+                    },
+                    # Nobody judges a model here: every image may take part in the mesh.
+                    "train": {"data": {"eval_mode": "none"}},
+                },
+                without=frozenset({"train", "evaluate", *KINDS, "assess"}),
+            ),
+            Preset(
                 "preview",
                 "A look within minutes, also without a GPU: small pictures, small networks.",
                 {
-                    "frames": {"num_frames": 72, "long_side_px": 960},
-                    "poses": {"max_image_px": 960, "num_features": 4096},
+                    **_SMALL_PICTURES,
                     "train": {
                         "max_steps": 1500,
                         "rays_per_step": 1024,
@@ -293,6 +325,14 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
 )
 
 
+def stages_skipped(preset: str, kind: str) -> frozenset[str]:
+    """The stages that a job skips: for its preset, and for its kind of capture.
+
+    Raises KeyError for an unknown preset or kind.
+    """
+    return PRESETS[preset].without | skipped_stages(kind)
+
+
 class OptionsError(ValueError):
     """Options that do not exist or are out of range. `errors`: (dotted path, what is wrong)."""
 
@@ -316,7 +356,8 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
     """Complete, checked, JSON-able options of all stages.
 
     preset: a key of `PRESETS`. overrides: nested `{stage: {option: value}}`.
-    Raises OptionsError naming each wrong option, and KeyError for an unknown preset.
+    Raises OptionsError naming each wrong option and each stage that has options here and is left
+    out by the preset, and KeyError for an unknown preset.
     """
     wanted = dict(PRESETS[preset].overrides)
     errors: list[tuple[str, str]] = [
@@ -329,6 +370,9 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
         given = overrides.get(name, {})
         if not isinstance(given, dict):
             errors.append((name, "expected an object of options"))
+            continue
+        if given and name in PRESETS[preset].without:
+            errors.append((name, f"the preset {preset} has no such stage"))
             continue
         try:
             if name == "train":

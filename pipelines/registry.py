@@ -2,7 +2,7 @@
 
 Stages are named by dotted path, so that the API can read this file without importing torch. Those
 that export the trained scene come from `pipelines.exports.catalogue`. Which of them a capture has
-no use for follows from what its importer brings.
+no use for follows from what its importer brings; a preset may leave out more (`pipelines.options`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _export_stage(export: Export) -> Stage:
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=2,
+        version=3,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",
@@ -67,6 +67,7 @@ STAGES: tuple[Stage, ...] = (
         run="pipelines.stages.depth:run",
         options="DepthOptions",
         time_limit_s=6 * 3600.0,
+        artifacts=(Artifact("depth.jpg", "depth.jpg", "image/jpeg", "any picture viewer"),),
     ),
     Stage(
         name="draft",
@@ -122,7 +123,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="report",
-        version=2,
+        version=3,
         after=("draft", "evaluate", *KINDS, "assess"),
         reads=(
             "ingest",

@@ -8,7 +8,7 @@ names its old state in the UPDATE itself and is checked against these tables.
                 |        |         |-> failed       no attempts left, or not worth another
             (create)     |         |-> cancelled
                  blocked, ready -> cancelled        the job was cancelled, or failed elsewhere
-                 skipped                            given at creation: the capture has no use for it
+                 skipped                            given at creation: no use for it in this job
 
     job:    queued -> running -> succeeded | failed
             queued -> cancelled

@@ -31,7 +31,8 @@ class KernelCompiler:
             dataclasses.asdict(
                 train_config(stage_options("train", resolve_options(name, {})["train"]))
             )
-            for name in PRESETS
+            for name, preset in PRESETS.items()
+            if "train" not in preset.without
         ]
         for part in _PARTS:
             process = subprocess.Popen(

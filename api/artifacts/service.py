@@ -59,12 +59,13 @@ def find(job: Job, name: str) -> Published:
     for found in published(job):
         if found.artifact.name == name:
             return found
-    known = sorted(artifact.name for stage in STAGES for artifact in stage.artifacts)
-    hint = (
-        f"The job is {job.state}; wait until the stage that makes it has succeeded."
-        if name in known
-        else f"A finished job has {', '.join(known)}."
-    )
+    makers = {artifact.name: stage.name for stage in STAGES for artifact in stage.artifacts}
+    if name not in makers:
+        hint = f"A finished job has {', '.join(sorted(makers))}."
+    elif any(row.name == makers[name] and row.state == "skipped" for row in job.stages):
+        hint = f"A job with preset {job.preset} on such a capture skips {makers[name]}."
+    else:
+        hint = f"The job is {job.state}; wait until the stage that makes it has succeeded."
     raise MissingError(f"Job {job.id} has no such artifact.", code="artifact_not_found", hint=hint)
 
 

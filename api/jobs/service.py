@@ -9,8 +9,8 @@ from api.artifacts import service as artifacts
 from api.deps import Services
 from api.jobs.schemas import JobRequest, JobView
 from api.problems import ConflictedError, FieldProblem, InvalidRequestError
-from pipelines.options import PRESETS, resolve_options
-from pipelines.registry import STAGES, skipped_stages
+from pipelines.options import PRESETS, resolve_options, stages_skipped
+from pipelines.registry import STAGES
 from storage import jobs, queries, records
 from storage.deletions import drain_deletions
 from storage.jobs import StageSeed
@@ -42,9 +42,9 @@ def choose_preset(session: Session, asked: str | None) -> tuple[str, str]:
     return asked, "asked for"
 
 
-def stage_seeds(kind: str) -> list[StageSeed]:
-    """The stages of a job on a capture of this kind."""
-    skipped = skipped_stages(kind)
+def stage_seeds(preset: str, kind: str) -> list[StageSeed]:
+    """The stages of a job with this preset on a capture of this kind."""
+    skipped = stages_skipped(preset, kind)
     return [
         StageSeed(stage.name, stage.after, stage.needs_gpu, stage.name in skipped)
         for stage in STAGES
@@ -68,7 +68,7 @@ def create(services: Services, wanted: JobRequest, background: BackgroundTasks) 
             preset=preset,
             preset_reason=reason,
             options=options,
-            stages=stage_seeds(kind),
+            stages=stage_seeds(preset, kind),
             labels=wanted.labels,
         )
         ready = jobs.ready_stage_ids(job)

@@ -3,7 +3,7 @@
 Reads the maps of `depth`, the posed cameras and their images. Writes `draft.glb`, the maps fused
 and cleaned as the final mesh is, with the photos' colours, and `draft.jpg`, the draft seen from a
 camera of the capture. Where the maps show no surface it writes nothing and says so: the job goes
-on, its mesh comes from training.
+on, its mesh comes from training. A job that trains nothing asks for more (`draft.required`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from pipelines.errors import ExportError
 from pipelines.exports.formats import glb
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.options import reach_of
@@ -36,10 +37,10 @@ _NUM_PROBES = 16
 
 
 def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
-    """Make the draft."""
+    """Make the draft. Raises ExportError `empty_mesh` where there is none and it is required."""
     maps = DepthMapsFile(ctx.workspace.stage("depth"))
     if len(maps) == 0:
-        return _nothing(ctx, "there are no depth maps")
+        return _nothing(options, ctx, "there are no depth maps")
     cameras = CamerasFile.load(ctx.workspace.posed_cameras)
     poses = np.asarray([image.world_from_camera for image in cameras.images], np.float64)
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
@@ -52,7 +53,9 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
             options.resolution,
         )
         if not shells:
-            return _nothing(ctx, "no depth map shows a surface near what the cameras look at")
+            return _nothing(
+                options, ctx, "no depth map shows a surface near what the cameras look at"
+            )
         share = _FUSE_SHARE - _LOAD_SHARE
         mesh = fuse_shells(
             views,
@@ -61,18 +64,25 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
             lambda done: ctx.progress(_LOAD_SHARE + share * done, "fusing depth", None),
         )
     if len(mesh.faces) == 0:
-        return _nothing(ctx, "no two depth maps agree on a surface")
+        return _nothing(options, ctx, "no two depth maps agree on a surface")
     glb.write_mesh(ctx.out / "draft.glb", mesh)
     _save_picture(ctx.out / "draft.jpg", mesh, probes[len(probes) // 2], shells[0].bounds.focus)
     return {
         "num_faces": len(mesh.faces),
-        "num_views": len(maps),
+        "num_views": len(views),
         "voxel": round(shells[0].voxel, 9),
         "bounds": shells[0].bounds.as_dict(),
     }
 
 
-def _nothing(ctx: StageContext, why: str) -> dict[str, Any]:
+def _nothing(options: DraftOptions, ctx: StageContext, why: str) -> dict[str, Any]:
+    if options.required:
+        raise ExportError(
+            f"The draft is empty: {why}.",
+            code="empty_mesh",
+            hint="A preset that trains, such as preview, sees more than depth maps do; plain or "
+            "shining surfaces need light, and pictures that overlap more.",
+        )
     ctx.logger.warning("There is no draft: %s.", why)
     return {"num_faces": 0, "why": why}
 

@@ -12,6 +12,7 @@ assets.depth (null with a reason), assets.views {held_out, num_views, width, hei
 warnings[] {code, message, hint, details},
 timings.<stage>_s, options, versions, artifacts[] {name, bytes, sha256}. Everything else may grow.
 
+metrics and assets are null, with a metrics_reason and an assets_reason, where nothing was trained.
 All of it comes from the manifests of the stages before; nothing is measured here.
 
 A job that failed has a report.json, too (`write_failed_report`): what its stages found before one
@@ -36,29 +37,52 @@ from pipelines.workspace import MANIFEST, Workspace
 
 REPORT_VERSION = 1
 
+_METRICS = (
+    "psnr",
+    "ssim",
+    "lpips",
+    "lpips_reason",
+    "lpips_backbone",
+    "num_images",
+    "width",
+    "height",
+    "protocol",
+    "half_unseen",
+    "floaters",
+    "floaters_reason",
+    "per_image",
+)
+_NOTHING_TRAINED: dict[str, Any] = {
+    "metrics": None,
+    "metrics_reason": "Nothing was trained: there are no held-out numbers.",
+    "assets": None,
+    "assets_reason": "The mesh is the draft, from depth maps alone; it was not compared with "
+    "photos.",
+}
+
 Manifests = dict[str, dict[str, Any]]
 
 
 def run(options: ReportOptions, ctx: StageContext) -> dict[str, Any]:
     """Write `report.json`. The summary is its headline numbers. Raises ExportError for a missing
-    manifest of a stage that every job has."""
+    manifest of a stage that every job has, or every job that trains, or every one that does not."""
     del options
     manifests = manifests_of(ctx.workspace)
-    for name in ("ingest", "train", "evaluate"):
+    for name in ("ingest", "evaluate") if "train" in manifests else ("ingest", "draft"):
         if name not in manifests:
             raise ExportError(
                 f"The report needs the result of {name}, which is not there.",
                 code="inputs_missing",
                 hint=f"Run {name} first.",
             )
-    report = build_report(manifests, CaptureRecord.load(ctx.workspace.stage("ingest")))
+    capture = CaptureRecord.load(ctx.workspace.stage("ingest"))
+    report = build_report(manifests, capture, trains="train" in manifests)
     (ctx.out / REPORT).write_text(json.dumps(report, indent=1), "utf-8")
     ctx.progress(1.0, "report written", 0.0)
     return {
         "capture_kind": report["capture"]["kind"],
         "registered_ratio": report["poses"]["registered_ratio"],
-        "psnr": report["metrics"]["psnr"],
-        "ssim": report["metrics"]["ssim"],
+        **({key: report["metrics"][key] for key in ("psnr", "ssim")} if report["metrics"] else {}),
         "num_warnings": len(report["warnings"]),
         "num_artifacts": len(report["artifacts"]),
     }
@@ -73,9 +97,13 @@ def manifests_of(workspace: Workspace) -> Manifests:
     }
 
 
-def build_report(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]:
-    """The content of `report.json`, of a job whose stages all succeeded so far."""
-    evaluated = manifests.get("evaluate", {}).get("summary", {})
+def build_report(
+    manifests: Manifests, capture: CaptureRecord, *, trains: bool = True
+) -> dict[str, Any]:
+    """The content of `report.json`, of a job whose stages all succeeded so far.
+
+    trains: whether training is among the job's stages; without it there is nothing to measure.
+    """
     assessed = manifests.get("assess", {}).get("summary", {})
     return {
         "version": REPORT_VERSION,
@@ -90,25 +118,7 @@ def build_report(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]
             "warnings": capture.warnings,
         },
         "poses": _poses(manifests, capture),
-        "metrics": {
-            key: evaluated.get(key)
-            for key in (
-                "psnr",
-                "ssim",
-                "lpips",
-                "lpips_reason",
-                "lpips_backbone",
-                "num_images",
-                "width",
-                "height",
-                "protocol",
-                "half_unseen",
-                "floaters",
-                "floaters_reason",
-                "per_image",
-            )
-        },
-        "assets": {key: value for key, value in assessed.items() if key != "warnings"} or None,
+        **(_quality(manifests) if trains else _NOTHING_TRAINED),
         "warnings": [
             *manifests.get("poses", {}).get("summary", {}).get("warnings", []),
             *assessed.get("warnings", []),
@@ -126,6 +136,16 @@ def build_report(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]
     }
 
 
+def _quality(manifests: Manifests) -> dict[str, Any]:
+    """What `evaluate` and `assess` measured, as far as they did."""
+    evaluated = manifests.get("evaluate", {}).get("summary", {})
+    assessed = manifests.get("assess", {}).get("summary", {})
+    return {
+        "metrics": {key: evaluated.get(key) for key in _METRICS},
+        "assets": {key: value for key, value in assessed.items() if key != "warnings"} or None,
+    }
+
+
 def _poses(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]:
     """How many images there were and how many have a pose.
 
@@ -139,8 +159,11 @@ def _poses(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]:
         num_images, num_registered = int(found["num_images"]), int(found["num_registered"])
     else:
         found, source = {"metric": capture.details.get("metric")}, "capture"
-        trained = manifests.get("train", {}).get("summary", {})
-        num_registered = int(trained.get("num_train", 0)) + int(trained.get("num_test", 0))
+        if "train" in manifests:
+            trained = manifests["train"]["summary"]
+            num_registered = int(trained.get("num_train", 0)) + int(trained.get("num_test", 0))
+        else:
+            num_registered = int(capture.details.get("num_posed", 0))
         num_images = max(num_registered, _pictures_in(capture))
     return {
         **found,

@@ -47,12 +47,20 @@ def test_a_job_goes_through_all_stages_once(engine: Engine) -> None:
     engine.wait(lambda: not list((engine.folder / "home" / "work").iterdir()), 45)
 
 
-def test_skipped_stages_are_passed_over(engine: Engine) -> None:
+@pytest.mark.parametrize("skip", [("frames",), ("train", "mesh", "video")])
+def test_skipped_stages_are_passed_over(engine: Engine, skip: tuple[str, ...]) -> None:
+    """One in the middle, as a capture skips it; and all that needs training, as a preset does."""
     engine.start_worker()
-    job = engine.wait_for(engine.submit({}, skip=("frames",)), "succeeded", "failed")
+    job = engine.wait_for(engine.submit({}, skip=skip), "succeeded", "failed")
     assert job.state == "succeeded", job.error
-    assert {row.name: row.state for row in job.stages}["frames"] == "skipped"
-    assert not engine.notes("frames")
+    wanted = {stage.name: "skipped" if stage.name in skip else "succeeded" for stage in STAGES}
+    assert {row.name: row.state for row in job.stages} == wanted
+    assert {note.split()[0] for note in engine.notes("")} == set(wanted) - set(skip)
+    report = engine.stage(job.id, "report").summary
+    assert report is not None
+    assert report["read"] == [
+        name for name in ("ingest", "train", "mesh", "video") if name not in skip
+    ]
 
 
 def test_an_error_of_the_input_fails_the_job_at_once_with_its_code(engine: Engine) -> None:

@@ -28,6 +28,7 @@ from api.cli_display import (
     watch_job,
 )
 from api.client import Client
+from pipelines.options import PRESETS
 from storage.jobs import stage_id
 from storage.leases import claim_stage, fail_stage, heartbeat
 from storage.records import append_logs
@@ -47,6 +48,16 @@ REPORT: dict[str, Any] = {
     "poses": {"num_images": 50, "num_registered": 46, "registered_ratio": 0.92},
     "metrics": {"psnr": 21.345, "ssim": 0.8123, "num_images": 5, "width": 480, "height": 270},
     "timings": {"ingest_s": 1.2, "train_s": 605.0},
+}
+
+DRAFT_REPORT: dict[str, Any] = {
+    "capture": {"kind": "images"},
+    "poses": {"num_images": 50, "num_registered": 46, "registered_ratio": 0.92},
+    "metrics": None,
+    "metrics_reason": "Nothing was trained.",
+    "assets": None,
+    "stages": {"draft": {"num_faces": 12345}},
+    "timings": {"ingest_s": 1.2, "draft_s": 5.0},
 }
 
 
@@ -108,6 +119,26 @@ def test_submit_and_download_ends_with_files_and_tables(
     assert job.labels == {"a": "b"}
 
 
+def test_a_draft_is_shown_without_numbers_that_nobody_measured(
+    command: LiveServer, archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def content(name: str) -> bytes:
+        return json.dumps(DRAFT_REPORT).encode() if name == "report.json" else b"x"
+
+    thread = when_submitted(command, lambda job: finish_job(command.services, job, content))
+    out = tmp_path / "out"
+    assert cli.main(["submit", str(archive), "--preset", "draft", "--download", str(out)]) == 0
+    thread.join()
+    assert (out / "draft.glb").is_file()
+    assert not (out / "mesh.glb").exists()
+    assert cli.main(["status"]) == 0
+    printed = capsys.readouterr().out
+    for text in ("skipped", "draft.glb", "12,345 triangles", "Nothing was trained", "46 of 50"):
+        assert text in printed, printed
+    for text in ("PSNR", "SSIM", "held-out images", "None"):
+        assert text not in printed, printed
+
+
 def test_failed_job_is_exit_status_1_with_its_advice(
     command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -152,7 +183,10 @@ def test_status_list_logs_cancel_delete_and_presets(
     assert cli.main(["delete", job]) == 1
     assert "cancel it first" in capsys.readouterr().err
     assert cli.main(["presets"]) == 0
-    assert "preview" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert all(preset in shown for preset in PRESETS), shown
+    with Client(command.url, KEY) as client:
+        assert "train" in {one.name: one.without for one in client.presets().items}["draft"]
 
 
 def test_logs_follow_until_the_job_is_over(

@@ -222,6 +222,9 @@ def test_presets_are_complete_and_options_are_described(service: Service) -> Non
     assert {item["name"]: item["options"] for item in found["items"]} == {
         name: resolve_options(name, {}) for name in PRESETS
     }
+    assert {item["name"]: set(item["without"]) for item in found["items"]} == {
+        name: preset.without for name, preset in PRESETS.items()
+    }
     schema = service.http.get("/v1/options").json()
     assert set(schema["properties"]) == set(STAGE_OPTIONS)
     assert schema["additionalProperties"] is False

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from pipelines.options import resolve_options
-from pipelines.registry import STAGE_NAMES
+from pipelines.options import PRESETS, resolve_options
+from pipelines.registry import STAGE_NAMES, STAGES
 from storage.jobs import stage_id
 from storage.leases import Claim, claim_stage, fail_stage, heartbeat
 from storage.records import append_logs, register_worker
@@ -73,6 +73,33 @@ def test_preset_is_preview_without_a_gpu_worker_and_standard_with_one(service: S
     assert service.job(capture["id"], preset="preview")["preset_reason"] == "asked for"
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_job_skips_what_its_preset_leaves_out_and_comes_to_its_end(
+    service: Service, preset: str
+) -> None:
+    job = service.job(preset=preset)
+    skipped = PRESETS[preset].without | {"frames"}  # the capture is photos
+    assert {name for name, state in states(job).items() if state == "skipped"} == skipped
+    finish_job(service.services, job["id"], lambda name: b"x")
+    job = service.http.get(f"/v1/jobs/{job['id']}").json()
+    assert job["state"] == "succeeded"
+    assert (job["metrics"] is None) == ("evaluate" in skipped)
+    made = [art.name for one in STAGES if one.name not in skipped for art in one.artifacts]
+    assert [item["name"] for item in job["artifacts"]] == made
+
+
+def test_a_draft_has_its_mesh_and_says_why_there_is_no_other(service: Service) -> None:
+    job = service.job(preset="draft")
+    finish_job(service.services, job["id"], lambda name: b"x")
+    names = [
+        artifact["name"]
+        for artifact in service.http.get(f"/v1/jobs/{job['id']}").json()["artifacts"]
+    ]
+    assert names == ["depth.jpg", "draft.glb", "draft.jpg", "report.json"]
+    answer = service.http.get(f"/v1/jobs/{job['id']}/artifacts/mesh.glb")
+    assert "skips mesh" in problem(answer, 404, "artifact_not_found")["hint"]
+
+
 def test_options_are_laid_over_the_preset(service: Service) -> None:
     job = service.job(preset="preview", options={"train": {"max_steps": 77}})
     assert job["options"] == resolve_options("preview", {"train": {"max_steps": 77}})
@@ -91,6 +118,12 @@ def test_options_are_laid_over_the_preset(service: Service) -> None:
             ["train.max_steps", "mesh.resolution"],
         ),
         ({"options": {"paint": {}}}, 422, "options_invalid", ["paint"]),
+        (
+            {"preset": "draft", "options": {"train": {"max_steps": 9}}},
+            422,
+            "options_invalid",
+            ["train"],
+        ),
         ({"options": {"train": 3}}, 422, "options_invalid", ["train"]),
         ({"options": []}, 422, "request_invalid", ["body.options"]),
         ({"colour": "red"}, 422, "request_invalid", ["body.colour"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import sys
 import types
@@ -22,7 +23,8 @@ from pipelines.manifest import (
     run_job_locally,
     run_stage,
 )
-from pipelines.registry import get_stage
+from pipelines.options import PRESETS, stages_skipped
+from pipelines.registry import STAGE_NAMES, STAGES, get_stage
 from pipelines.stage import Stage, StageContext
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.captures.archives import nerfstudio_files, picture, write_zip
@@ -245,5 +247,47 @@ def test_result_with_changed_input_is_not_current(
 
 def test_missing_inputs_leave_out_skipped_stages(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path)
-    assert missing_inputs("train", "video", workspace) == ["ingest", "frames", "poses", "depth"]
-    assert missing_inputs("train", "polycam", workspace) == ["ingest", "depth"]
+    before = ["ingest", "frames", "poses", "depth"]
+    assert missing_inputs("train", "preview", "video", workspace) == before
+    assert missing_inputs("train", "preview", "polycam", workspace) == ["ingest", "depth"]
+    assert missing_inputs("report", "draft", "video", workspace) == [*before, "draft"]
+
+
+@pytest.fixture
+def empty_stages(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The registry's stages, which only write down that they ran, into this list."""
+    ran: list[str] = []
+
+    def body(options: Any, ctx: StageContext) -> dict[str, Any]:
+        ran.append(ctx.stage)
+        return {}
+
+    module = types.ModuleType("nerfworks_stages_under_test")
+    module.run = body  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    stages = tuple(dataclasses.replace(stage, run=f"{module.__name__}:run") for stage in STAGES)
+    monkeypatch.setattr("pipelines.manifest.STAGES", stages)
+    return ran
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("kind", ["video", "polycam"])
+def test_a_job_runs_what_neither_capture_nor_preset_leave_out(
+    tmp_path: Path, empty_stages: list[str], preset: str, kind: str
+) -> None:
+    manifests = run_job_locally(Workspace(tmp_path), preset, {}, kind=kind)
+    skipped = stages_skipped(preset, kind)
+    assert empty_stages == [name for name in STAGE_NAMES if name not in skipped]
+    assert list(manifests) == empty_stages
+
+
+def test_another_preset_goes_on_from_what_it_shares_and_removes_what_it_skips(
+    tmp_path: Path, empty_stages: list[str]
+) -> None:
+    workspace = Workspace(tmp_path)
+    run_job_locally(workspace, "preview", {}, kind="video")
+    assert empty_stages == list(STAGE_NAMES)
+    empty_stages.clear()
+    run_job_locally(workspace, "draft", {}, kind="video")
+    assert empty_stages == ["depth", "draft", "report"], "the same frames and poses"
+    assert not workspace.stage("train").exists(), "the report must not count it"

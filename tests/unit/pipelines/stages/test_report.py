@@ -159,3 +159,44 @@ def test_warnings_stand_beside_the_assets_they_are_about() -> None:
 def test_a_missing_stage_is_named(job: Workspace) -> None:
     with pytest.raises(ExportError, match="needs the result of evaluate"):
         tiny_job.run(job, "report")
+
+
+@pytest.fixture
+def untrained(tmp_path: Path) -> Workspace:
+    """A posed capture of 20 pictures with a draft; nothing was trained."""
+    workspace = Workspace(tmp_path)
+    summaries: dict[str, dict[str, Any]] = {
+        "ingest": {"kind": "polycam"},
+        "depth": {"num_maps": 20},
+        "draft": {"num_faces": 777},
+    }
+    for name, summary in summaries.items():
+        workspace.stage(name).mkdir()
+        manifest = {"content": name, "summary": summary, "timings": {"wall_s": 1.0}, "options": {}}
+        files = [{"path": "draft.glb", "bytes": 5, "sha256": "00"}] if name == "draft" else []
+        text = json.dumps({**manifest, "files": files})
+        (workspace.stage(name) / "manifest.json").write_text(text)
+    details = {"num_posed": 20, "num_frames": 20, "num_without_pose": 2, "metric": True}
+    CaptureRecord("polycam", "a.zip", "00", details=details).save(workspace.stage("ingest"))
+    return workspace
+
+
+def test_a_job_that_trains_nothing_says_so_in_its_report(untrained: Workspace) -> None:
+    manifest = tiny_job.run(untrained, "report")
+    report = json.loads((untrained.stage("report") / "report.json").read_text())
+    assert (report["state"], report["error"]) == ("succeeded", None)
+    assert (report["metrics"], report["assets"]) == (None, None)
+    assert "Nothing was trained" in report["metrics_reason"]
+    assert "not compared with photos" in report["assets_reason"]
+    assert (report["poses"]["num_images"], report["poses"]["num_registered"]) == (22, 20)
+    assert report["stages"]["draft"] == {"num_faces": 777}
+    assert set(report["timings"]) == {"ingest_s", "depth_s", "draft_s"}
+    assert report["artifacts"] == [{"name": "draft.glb", "bytes": 5, "sha256": "00"}]
+    assert manifest["summary"]["num_artifacts"] == 1
+    assert "psnr" not in manifest["summary"]
+
+
+def test_a_report_needs_a_draft_where_nothing_was_trained(untrained: Workspace) -> None:
+    (untrained.stage("draft") / "manifest.json").unlink()
+    with pytest.raises(ExportError, match="needs the result of draft"):
+        tiny_job.run(untrained, "report")

@@ -1,0 +1,73 @@
+"""Presets: complete, consistent, and clear about what they leave out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pipelines.options import (
+    PRESETS,
+    STAGE_OPTIONS,
+    OptionsError,
+    resolve_options,
+    stages_skipped,
+)
+from pipelines.registry import STAGE_NAMES, STAGES, skipped_stages
+
+NEEDED_WHERE_THERE = {"report"}
+"""Stages that take what there is of what they read."""
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_has_options_for_every_stage_it_keeps(preset: str) -> None:
+    resolved = resolve_options(preset, {})
+    assert set(resolved) == set(STAGE_OPTIONS) == set(STAGE_NAMES)
+    assert set(PRESETS[preset].overrides) <= set(STAGE_NAMES)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_leaves_out_no_stage_that_another_needs(preset: str) -> None:
+    without = PRESETS[preset].without
+    assert without < set(STAGE_NAMES)
+    for stage in STAGES:
+        if stage.name not in without | NEEDED_WHERE_THERE:
+            assert not without & {*stage.reads, *stage.after}, stage.name
+
+
+def test_a_job_skips_for_its_preset_and_for_its_capture() -> None:
+    assert stages_skipped("preview", "video") == frozenset()
+    assert stages_skipped("preview", "polycam") == skipped_stages("polycam")
+    kept = set(STAGE_NAMES) - stages_skipped("draft", "video")
+    assert kept == {"ingest", "frames", "poses", "depth", "draft", "report"}
+    assert kept - stages_skipped("draft", "polycam") == {"ingest", "depth", "draft", "report"}
+    with pytest.raises(KeyError):
+        stages_skipped("ultra", "video")
+
+
+def test_a_draft_takes_every_image_and_must_give_a_mesh() -> None:
+    resolved = resolve_options("draft", {"draft": {"resolution": 64}})
+    assert resolved["depth"]["held_out"]["eval_mode"] == "none"
+    assert (resolved["draft"]["resolution"], resolved["draft"]["required"]) == (64, True)
+    preview = resolve_options("preview", {})
+    assert preview["draft"]["required"] is False
+    assert all(resolved[name] == preview[name] for name in ("ingest", "frames", "poses"))
+
+
+@pytest.mark.parametrize(
+    ("given", "paths"),
+    [
+        ({"train": {"max_steps": 9}}, ["train"]),
+        ({"mesh": {"resolution": 64}, "video": {"num_frames": 8}}, ["mesh", "video"]),
+        ({"train": {}}, []),
+    ],
+)
+def test_options_of_a_stage_that_the_preset_leaves_out_are_refused(
+    given: dict[str, Any], paths: list[str]
+) -> None:
+    if not paths:
+        assert resolve_options("draft", given) == resolve_options("draft", {})
+        return
+    with pytest.raises(OptionsError, match="draft has no such stage") as caught:
+        resolve_options("draft", given)
+    assert sorted(path for path, _ in caught.value.errors) == paths
