@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import io
 import json
+import tempfile
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -43,6 +45,15 @@ def _png(array: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(array).save(buffer, "PNG")
     return buffer.getvalue()
+
+
+def _exr(z: NDArray[Any]) -> bytes:
+    """Half floats in the channel R, ZIP, as Record3D writes them."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "depth.exr"
+        OpenEXR.File(header, {"R": z.astype(np.float16)}).write(str(path))
+        return path.read_bytes()
 
 
 def _json(value: Any) -> str:
@@ -73,6 +84,19 @@ def landscape_camera(width: int = 640) -> Intrinsics:
     focal = 0.72 * width
     return Intrinsics(
         width=width, height=height, fl_x=focal, fl_y=focal, cx=width / 2 + 3.2, cy=height / 2 - 2.4
+    )
+
+
+def reduced(camera: Intrinsics, factor: int = 4) -> Intrinsics:
+    """The same view with fewer pixels, as a depth sensor has it."""
+    return replace(
+        camera,
+        width=camera.width // factor,
+        height=camera.height // factor,
+        fl_x=camera.fl_x / factor,
+        fl_y=camera.fl_y / factor,
+        cx=camera.cx / factor,
+        cy=camera.cy / factor,
     )
 
 
@@ -114,9 +138,7 @@ def write_polycam(
     pictures = render_all(truth)
     kind = "corrected_" if corrected else ""
     names: dict[int, str] = {}
-    low = replace(camera, width=width // 4, height=camera.height // 4)
-    low = replace(low, fl_x=camera.fl_x / 4, fl_y=camera.fl_y / 4)
-    low = replace(low, cx=camera.cx / 4, cy=camera.cy / 4)
+    low = reduced(camera)
     with zipfile.ZipFile(path, "w") as archive:
         for index, picture in enumerate(pictures):
             pose = pose_matrix(truth.images[index])
@@ -169,9 +191,14 @@ def _polycam_camera(camera: Intrinsics, pose: Floats, index: int) -> str:
 
 
 def write_record3d(
-    path: Path, num: int = 24, long_side_px: int = 640, missing: int = 5, folder: str = "EXR_RGBD/"
+    path: Path,
+    num: int = 24,
+    long_side_px: int = 640,
+    missing: int = 5,
+    folder: str = "EXR_RGBD/",
+    depth: bool = False,
 ) -> CamerasFile:
-    """A Record3D "EXR + JPG" export without its depth: `rgb/<n>.jpg` and `metadata.json`.
+    """A Record3D "EXR + JPG" export: `rgb/<n>.jpg`, `metadata.json`, and `depth/<n>.exr` if wanted.
 
     K is column-major, poses are [qx, qy, qz, qw, tx, ty, tz] in ARKit's frame, upright pictures.
     The picture of frame `missing` is not there, but its pose is: number n belongs to `poses[n]`.
@@ -192,6 +219,9 @@ def write_record3d(
             if index != missing:
                 names[index] = f"{folder}rgb/{index}.jpg"
                 archive.writestr(names[index], _jpeg(picture))
+                if depth:
+                    z = depth_image(reduced(camera), pose_matrix(truth.images[index]))
+                    archive.writestr(f"{folder}depth/{index}.exr", _exr(z))
         metadata = {
             "w": width,
             "h": height,
@@ -209,9 +239,14 @@ def write_record3d(
 
 
 def write_nerfstudio(
-    path: Path, num: int = 24, long_side_px: int = 480, missing: int = 3, folder: str = ""
+    path: Path,
+    num: int = 24,
+    long_side_px: int = 480,
+    missing: int = 3,
+    folder: str = "",
+    depth: bool = False,
 ) -> CamerasFile:
-    """nerfstudio's layout: `transforms.json`, +Z up, OpenGL cameras, and `images/`.
+    """nerfstudio's layout: `transforms.json`, +Z up, OpenGL cameras, `images/`, `depth/` if wanted.
 
     `transforms.json` lists one picture that is not there, and lists them in another order than
     their names have.
@@ -219,13 +254,16 @@ def write_nerfstudio(
     camera = phone_camera(long_side_px)
     truth = walk(num, camera)
     names = {index: f"{folder}images/frame_{index + 1:05d}.jpg" for index in range(num)}
-    frames = [
+    frames: list[dict[str, Any]] = [
         {
             "file_path": names[index].removeprefix(folder),
             "transform_matrix": _matrix(pose_matrix(truth.images[index])),
         }
         for index in reversed(range(num))
     ]
+    if depth:
+        for frame in frames:
+            frame["depth_file_path"] = f"depth/{Path(frame['file_path']).stem}.png"
     transforms = {
         "camera_model": "OPENCV",
         "w": camera.width,
@@ -242,6 +280,10 @@ def write_nerfstudio(
         for index, picture in enumerate(render_all(truth)):
             if index != missing:
                 archive.writestr(names[index], _jpeg(picture))
+                if depth:
+                    z = depth_image(reduced(camera), pose_matrix(truth.images[index]))
+                    counts = np.round(np.clip(z, 0.0, 65.0) * 1000.0).astype(np.uint16)
+                    archive.writestr(f"{folder}depth/{Path(names[index]).stem}.png", _png(counts))
     del names[missing]
     return _named(truth, names)
 

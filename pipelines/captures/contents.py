@@ -25,12 +25,34 @@ class Photos:
 
 
 @dataclass(frozen=True)
+class SensorDepth:
+    """Depth that the phone measured beside a picture, along the camera's axis (z, not the ray).
+
+    name: in the archive, a 16-bit PNG or an OpenEXR. It shows what the picture shows, at a
+    resolution of its own. unit: world units per stored value.
+    confidence: a picture of the same size, or None; where it is below `least_confidence`, the depth
+    counts as unknown.
+    """
+
+    name: str
+    unit: float
+    confidence: str | None = None
+    least_confidence: int = 0
+
+    @property
+    def files(self) -> list[str]:
+        """Its files in the archive."""
+        return [self.name] if self.confidence is None else [self.name, self.confidence]
+
+
+@dataclass(frozen=True)
 class PosedSource:
     """One picture of the archive that has a pose.
 
     name: in the archive. lens: gives the intrinsics for the picture's real width and height.
     world_from_camera: rows [3, 4] of finite numbers; whether they are a pose is checked later.
     mask: a picture in the archive, black where the picture is to be ignored, or None.
+    depth: what the phone's sensor measured, in the unit of the poses, or None.
     """
 
     name: str
@@ -38,6 +60,12 @@ class PosedSource:
     world_from_camera: Rows
     timestamp_s: float | None = None
     mask: str | None = None
+    depth: SensorDepth | None = None
+
+    @property
+    def depth_files(self) -> list[str]:
+        """The files of its depth in the archive."""
+        return [] if self.depth is None else self.depth.files
 
 
 @dataclass(frozen=True)

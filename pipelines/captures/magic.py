@@ -39,6 +39,11 @@ def image_format(head: bytes) -> str | None:
     return None
 
 
+def is_exr(head: bytes) -> bool:
+    """Whether the bytes open an OpenEXR file."""
+    return head[:4] == b"\x76\x2f\x31\x01"
+
+
 def foreign_image(head: bytes) -> str | None:
     """The name of a photo format that is recognised but not read ("HEIC", ...), else None."""
     if head[4:8] == b"ftyp":

@@ -148,23 +148,29 @@ class PictureWriter:
             return image
 
     def _opened(self, name: str, kind: str) -> PIL.Image.Image:
-        """The extracted picture, fully decoded."""
-        try:
-            with warnings.catch_warnings():
-                # Pillow only warns between its limit and twice that; our own limit is an error.
-                warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
-                image = PIL.Image.open(self._raw, formats=[kind])
-            if image.width * image.height > self._max_pixels:
-                raise _undecodable(
-                    name,
-                    f"has {image.width}x{image.height} pixels; {self._max_pixels} are allowed",
-                )
-            image.load()
-        except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
-            if isinstance(error, OSError) and error.errno is not None:
-                raise  # the disk's fault, not the picture's
-            raise _undecodable(name, "does not decode") from error
-        return image
+        return opened(self._raw, name, kind, self._max_pixels)
+
+
+def opened(path: Path, name: str, kind: str, max_pixels: int) -> PIL.Image.Image:
+    """An extracted picture, fully decoded. name: in the archive. kind: Pillow's name of its format.
+
+    Raises CaptureError image_undecodable, also for more than `max_pixels`.
+    """
+    try:
+        with warnings.catch_warnings():
+            # Pillow only warns between its limit and twice that; our own limit is an error.
+            warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
+            image = PIL.Image.open(path, formats=[kind])
+        if image.width * image.height > max_pixels:
+            raise _undecodable(
+                name, f"has {image.width}x{image.height} pixels; {max_pixels} are allowed"
+            )
+        image.load()
+    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the disk's fault, not the picture's
+        raise _undecodable(name, "does not decode") from error
+    return image
 
 
 def _undecodable(name: str, why: str) -> CaptureError:

@@ -1,4 +1,4 @@
-"""Captures that bring camera poses: their poses checked, their pictures and `cameras.json` written.
+"""Captures that bring camera poses: their poses checked, pictures, depth, `cameras.json` written.
 
 World frame: +Z up. Camera frame: OpenGL (+X right, +Y up, looks along -Z).
 """
@@ -6,12 +6,14 @@ World frame: +Z up. Camera frame: OpenGL (+X right, +Y up, looks along -Z).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, Rows
+from pipelines.captures.depth_files import DepthWriter
 from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.captures.parsing import malformed
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
@@ -30,13 +32,14 @@ _SLACK = 0.05
 
 @dataclass(frozen=True)
 class _Stored:
-    """A picture as written, with its camera. mask: relative to the stage's folder, or None."""
+    """A picture as written, with its camera. mask, depth: below the stage's folder, or None."""
 
     picture: Picture
     lens: Intrinsics
     world_from_camera: Rows
     timestamp_s: float | None
     mask: str | None
+    depth: str | None
 
 
 def write_posed(
@@ -46,30 +49,39 @@ def write_posed(
     options: IngestOptions,
     ctx: StageContext,
 ) -> Found:
-    """Write the pictures, masks and `cameras.json` of a posed capture into `ctx.out`.
+    """Write the pictures, masks, depth and `cameras.json` of a posed capture into `ctx.out`.
 
     source: what `cameras.json` says the poses came from.
-    Frames that cannot be used are left out where they are few. Raises CaptureError as
+    Frames that cannot be used are left out where they are few; depth that cannot be used costs no
+    frame. Raises CaptureError as
     `storing.store_each` does, with the code of the frames' own errors where they are many.
     """
     sources = capture.sources
     if capture.is_dense:
         picked = evenly_picked(len(sources), options.max_posed_images)
         kept = {sources[index].name for index in picked}
+        left = [item for item in sources if item.name not in kept]
         archive.set_aside(
-            [item.name for item in sources if item.name not in kept],
+            [name for item in left for name in (item.name, *item.depth_files)],
             f"of {len(sources)} pictures {len(picked)} are taken, at even distances",
         )
         sources = [sources[index] for index in picked]
-    stored, warnings = store_each(
-        archive,
-        sources,
-        _store,
-        options,
-        ctx,
-        upright=False,
-        minimum=MIN_POSED_IMAGES,
-        failures=capture.failures,
+    depths = DepthWriter(archive, ctx.out, max_pixels=options.max_pixels)
+    try:
+        stored, warnings = store_each(
+            archive,
+            sources,
+            partial(_store, depths),
+            options,
+            ctx,
+            upright=False,
+            minimum=MIN_POSED_IMAGES,
+            failures=capture.failures,
+        )
+    finally:
+        depths.close()
+    archive.set_aside(
+        [name for item in sources for name in item.depth_files], "their pictures are left out"
     )
     cameras: dict[Intrinsics, int] = {}
     images = tuple(
@@ -79,6 +91,7 @@ def write_posed(
             world_from_camera=item.world_from_camera,
             timestamp_s=item.timestamp_s,
             mask=item.mask,
+            depth=item.depth,
         )
         for item in stored
     )
@@ -94,28 +107,37 @@ def write_posed(
         details={
             "num_posed": len(images),
             "num_lenses": len(cameras),
+            "num_depths": sum(image.depth is not None for image in images),
             "metric": capture.metric,
             **capture.details,
         },
-        warnings=[*capture.warnings, *warnings],
+        warnings=[*capture.warnings, *warnings, *depths.warnings],
     )
 
 
-def _store(writer: PictureWriter, source: PosedSource, number: int) -> _Stored:
-    """Write one picture and its mask. Raises CaptureError for what makes the frame unusable."""
+def _store(depths: DepthWriter, writer: PictureWriter, source: PosedSource, number: int) -> _Stored:
+    """Write one picture, its mask and its depth.
+
+    Raises CaptureError for what makes the frame unusable.
+    """
     what = f'"{shown(source.name)}"'
     pose = checked_pose(np.array(source.world_from_camera, np.float64), what)
     picture = writer.store(source.name, number)
+    size = (picture.width, picture.height)
     lens = checked_lens(source.lens(picture.width, picture.height), what)
     mask = None
     if source.mask is not None:
-        mask = writer.store_mask(source.mask, number, (picture.width, picture.height))
+        mask = writer.store_mask(source.mask, number, size)
+    depth = None
+    if source.depth is not None:
+        depth = depths.store(source.depth, number, size)
     return _Stored(
         picture=picture,
         lens=lens,
         world_from_camera=tuple(tuple(float(value) for value in row) for row in pose),
         timestamp_s=source.timestamp_s,
         mask=mask,
+        depth=depth,
     )
 
 

@@ -3,21 +3,25 @@
 Instant NGP, nerfstudio and the Blender scenes of NeRF write it, each with keys of its own. At the
 top or in a frame: fl_x fl_y cx cy w h, k1..k4 p1 p2 or distortion_params (k1 k2 k3 k4 p1 p2),
 camera_angle_x/y (radians) in place of focal lengths, camera_model, is_fisheye. In a frame:
-file_path, transform_matrix (world_from_camera, OpenGL camera), mask_path, timestamp or time.
-Standard library only.
+file_path, transform_matrix (world_from_camera, OpenGL camera), mask_path, timestamp or time,
+depth_file_path. Standard library only.
+
+Depth is counts along the camera's axis; a count is depth_unit_scale_factor (at the top or in the
+frame, 0.001 without it) units of the original world, and applied_scale, where the file has it, has
+brought the poses from that world to the file's: nerfstudio multiplies depth by both, and so do we.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 from pipelines.captures.archive_rules import shown
-from pipelines.captures.contents import PosedSource
+from pipelines.captures.contents import PosedSource, SensorDepth
 from pipelines.captures.named_files import NamedFiles
 from pipelines.captures.parsing import (
     each_frame,
@@ -43,6 +47,9 @@ MODELS = {
 }
 """Camera models that are read, and what they become."""
 
+DEFAULT_DEPTH_UNIT = 0.001
+"""nerfstudio's `depth_unit_scale_factor`: millimetres in a world of metres."""
+
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 Values = Mapping[str, Any]
@@ -52,8 +59,8 @@ Values = Mapping[str, Any]
 class Listed:
     """What the frames of a file come to.
 
-    named: all files that frames name, masks among them. num_missing: frames whose picture is not
-    in the archive.
+    named: all files that frames name, masks and depth among them. num_missing: frames whose picture
+    is not in the archive.
     """
 
     sources: list[PosedSource]
@@ -74,7 +81,15 @@ class Frame:
     @property
     def mask_path(self) -> str:
         """Where its mask should be, or ""."""
-        path = self.own.get("mask_path")
+        return self._path("mask_path")
+
+    @property
+    def depth_path(self) -> str:
+        """Where its depth should be, or ""."""
+        return self._path("depth_file_path")
+
+    def _path(self, key: str) -> str:
+        path = self.own.get(key)
         return path if isinstance(path, str) else ""
 
 
@@ -91,12 +106,16 @@ def read_transforms(archive: CaptureArchive, name: str) -> tuple[Values, list[An
 
 
 def read_frames(
-    archive: CaptureArchive, root: str, file: str, listed: Sequence[tuple[Values, Any]]
+    archive: CaptureArchive,
+    root: str,
+    file: str,
+    listed: Sequence[tuple[Values, Any]],
+    with_depth: bool = False,
 ) -> Listed:
     """The pictures that frames name, and their poses.
 
     root: folder that paths are relative to. file: what messages call the listing. listed: keys of
-    the top, and a frame, for each frame.
+    the top, and a frame, for each frame. with_depth: whether depth_file_path is heeded.
     Raises CaptureError: poses_missing where no picture is in the archive.
     """
     if not listed:
@@ -112,10 +131,16 @@ def read_frames(
             there.setdefault(found[frame.path], frame)
     if not there:
         raise (failures or [_none_there(file, len(listed))])[0]
+    depths = _Depths()
+    if with_depth:
+        taken = {*found.values(), *masks.values()}
+        depths = _depths(archive, root, file, frames, there, taken)
     sources, unusable = each_frame(
         archive,
         there,
-        lambda name, frame: _source(file, name, frame, masks.get(frame.mask_path)),
+        lambda name, frame: _source(
+            file, name, frame, masks.get(frame.mask_path), depths.of.get(name)
+        ),
     )
     absent = [frame.path for frame in frames if frame.path not in found]
     warnings = _warnings(file, frames, absent, loose | mask_loose)
@@ -129,11 +154,12 @@ def read_frames(
             f"{len(lost)} masks that {file} names are not in the archive, and their pictures "
             f"are used whole: {some_of(lost)}."
         )
+    warnings += depths.warnings
     return Listed(
         sources=sources,
         failures=failures + unusable,
         warnings=warnings,
-        named=frozenset([*found.values(), *masks.values()]),
+        named=frozenset([*found.values(), *masks.values()]) | depths.named,
         num_missing=len(absent),
     )
 
@@ -181,7 +207,72 @@ def _warnings(
     return warnings
 
 
-def _source(file: str, name: str, frame: Frame, mask: str | None) -> PosedSource:
+@dataclass(frozen=True)
+class _Depths:
+    """Depth of pictures, by their names. named: all files that frames name as depth."""
+
+    of: dict[str, SensorDepth] = field(default_factory=dict)
+    named: frozenset[str] = frozenset()
+    warnings: list[str] = field(default_factory=list)
+
+
+def _depths(
+    archive: CaptureArchive,
+    root: str,
+    file: str,
+    frames: Sequence[Frame],
+    there: Mapping[str, Frame],
+    taken: Collection[str],
+) -> _Depths:
+    """The depth that frames name.
+
+    there: frames whose pictures are there, by those. taken: files that are something else already.
+    """
+    files = NamedFiles(archive.names - frozenset(taken), root)
+    exact, loose = files.find(frame.depth_path for frame in frames if frame.depth_path)
+    names = exact | loose
+    wanted = {name: frame for name, frame in there.items() if frame.depth_path}
+    depths: dict[str, SensorDepth] = {}
+    faults: list[str] = []
+    for name, frame in wanted.items():
+        if depth := names.get(frame.depth_path):
+            try:
+                depths[name] = SensorDepth(depth, _depth_unit(frame.values, file))
+            except CaptureError as error:
+                faults.append(error.message)
+                archive.told([depth])
+    archive.set_aside(names.values(), "their pictures are left out")
+    lost = [frame.depth_path for frame in wanted.values() if frame.depth_path not in names]
+    warnings = []
+    if lost:
+        warnings.append(
+            f"{len(lost)} of {len(wanted)} depth maps that {file} names are not in the archive, "
+            f"and their pictures are used without: {some_of(lost)}."
+        )
+    if faults:
+        warnings.append(f"{len(faults)} depth maps are not used: {faults[0]}")
+    if loose:
+        path, found = min(loose.items())
+        warnings.append(
+            f"{len(loose)} depth maps were matched by the end of the name, as "
+            f'"{shown(path)}" with "{shown(found)}".'
+        )
+    return _Depths(depths, frozenset(names.values()), warnings)
+
+
+def _depth_unit(values: Values, file: str) -> float:
+    """World units per count of a depth map. Raises CaptureError poses_malformed."""
+    key = "depth_unit_scale_factor"
+    unit = number(values.get(key, DEFAULT_DEPTH_UNIT), f"{key} of {file}")
+    scale = number(values.get("applied_scale", 1.0), f"applied_scale of {file}")
+    if unit <= 0 or scale <= 0:
+        raise malformed(f"{key} or applied_scale of {file} is not above 0.")
+    return unit * scale
+
+
+def _source(
+    file: str, name: str, frame: Frame, mask: str | None, depth: SensorDepth | None
+) -> PosedSource:
     what = f'"{shown(name)}"'
     rows = frame.own.get("transform_matrix")
     if rows is None:
@@ -193,6 +284,7 @@ def _source(file: str, name: str, frame: Frame, mask: str | None) -> PosedSource
         world_from_camera=pose_rows(rows, f"the pose of {what}"),
         timestamp_s=None if time is None else number(time, f"The time of {what}"),
         mask=mask,
+        depth=depth,
     )
 
 

@@ -107,6 +107,11 @@ def read_depth_png(path: Path, unit: float, shape: tuple[int, int]) -> NDArray[n
         raise ValueError(f"{path.name} is no depth picture: {error}") from error
     if stored.ndim != 2 or mode == "L":
         raise ValueError(f"{path.name} is no 16-bit one-channel depth picture, but {mode}")
+    return (nearest(stored, shape).astype(np.float64) * unit).astype(np.float32)
+
+
+def nearest(stored: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """A map [h, w] brought to `shape`; each pixel takes the nearest stored value."""
     rows = ((np.arange(shape[0]) + 0.5) * stored.shape[0] / shape[0]).astype(int)
     columns = ((np.arange(shape[1]) + 0.5) * stored.shape[1] / shape[1]).astype(int)
-    return (stored[np.ix_(rows, columns)].astype(np.float64) * unit).astype(np.float32)
+    return stored[np.ix_(rows, columns)]

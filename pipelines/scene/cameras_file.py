@@ -50,7 +50,9 @@ class PosedImage:
     world_from_camera: 3x4, row-major nested tuples, rotation and camera centre.
     split: "train" or "test" once training has chosen, else None.
     mask: path of a one-channel image, black = ignore, or None.
-    depth: path of a depth image, or None.
+    depth: path of the depth that a sensor measured (`pipelines.scene.sensor_depth`): npz with `z`,
+        float32 [h, w], world units along the camera's axis, 0 = unknown. It covers the image at a
+        resolution of its own, lens distortion included. Or None.
     """
 
     file: str

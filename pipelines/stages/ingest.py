@@ -1,7 +1,7 @@
 """Stage `ingest`: what was sent, checked, and its pictures and poses in our own form.
 
-Writes `capture.json` (always), `images/` (photos and app exports), `masks/` and `cameras.json`
-(captures with poses). A video stays where it is: `frames` reads the upload.
+Writes `capture.json` (always), `images/` (photos and app exports), `masks/`, `depth/` and
+`cameras.json` (captures with poses). A video stays where it is: `frames` reads the upload.
 """
 
 from __future__ import annotations

@@ -3,12 +3,12 @@
 Keys: `pipelines.captures.transforms_json`; at the top also applied_transform, applied_scale.
 
 The file's world is kept as it is and taken as +Z up: that is nerfstudio's own convention, and what
-`applied_transform` has led to; both it and `applied_scale` are written down in the notes.
+`applied_transform` has led to; both it and `applied_scale` are written down in the notes. Nothing
+says that its unit is the metre, also where there is depth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from pipelines.captures.contents import PosedPictures
@@ -34,9 +34,9 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     Raises CaptureError: poses_missing, poses_malformed.
     """
     top, frames = read_transforms(archive, claim.root + _FILE)
-    listed = read_frames(archive, claim.root, _FILE, [(top, frame) for frame in frames])
+    listed = read_frames(archive, claim.root, _FILE, [(top, frame) for frame in frames], True)
     unlisted = archive.images - listed.named
-    unread = _unread(archive, claim.root, top, frames)
+    unread = _unread(archive, claim.root, top)
     archive.set_aside(unlisted, f"not listed in {_FILE}")
     return PosedPictures(
         sources=listed.sources,
@@ -52,22 +52,12 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     )
 
 
-def _unread(archive: CaptureArchive, root: str, top: Values, frames: Sequence[Any]) -> list[str]:
+def _unread(archive: CaptureArchive, root: str, top: Values) -> list[str]:
     """What the file says and nobody heeds: warnings; files that it names are set aside."""
-    files = NamedFiles(archive.names, root)
-    depths = [
-        str(frame["depth_file_path"])
-        for frame in frames
-        if isinstance(frame, dict) and frame.get("depth_file_path")
-    ]
-    exact, loose = files.find(depths)
-    archive.set_aside((exact | loose).values(), "depth is not read")
     if isinstance(cloud := top.get("ply_file_path"), str):
-        exact, loose = files.find([cloud])
+        exact, loose = NamedFiles(archive.names, root).find([cloud])
         archive.set_aside((exact | loose).values(), "point clouds are not read")
     warnings = []
-    if depths:
-        warnings.append(f"{_FILE} names {len(depths)} depth maps; depth is not used.")
     if cloud:
         warnings.append(f"{_FILE} names a point cloud; it is not used.")
     if any(key in top for key in _SPLITS):

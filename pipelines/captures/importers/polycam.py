@@ -4,17 +4,23 @@
     keyframes/cameras/<us>.json keyframes/corrected_cameras/<us>.json
     camera: fx fy cx cy width height blur_score t_00 .. t_23 (row-major world_from_camera [3, 4])
 
+    keyframes/depth/<us>.png    16 bits, millimetres along the camera's axis, 0 where unknown
+    keyframes/confidence/<us>.png   8 bits, the size of the depth: 0, 127 or 255, as ARKit rates it
+
 The `corrected_` ones are there unless the session was too large for Polycam's optimiser, and are
-better. World: ARKit's, metres, +Y up; turned to +Z up here.
+better. World: ARKit's, metres, +Y up; turned to +Z up here. Only depth of the highest confidence is
+kept: what is below is drawn across edges. No real export was at hand: the layout is that of the
+public readers of the format. That depth fits the corrected pictures is nerfstudio's reading of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import PurePosixPath
 
 from pipelines.captures.archive_rules import shown
-from pipelines.captures.contents import PosedPictures, PosedSource
+from pipelines.captures.contents import PosedPictures, PosedSource, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.parsing import (
     each_frame,
@@ -22,6 +28,7 @@ from pipelines.captures.parsing import (
     missing,
     number,
     resized,
+    some_of,
     z_up_from_y_up,
 )
 from pipelines.captures.unpack import CaptureArchive
@@ -32,6 +39,9 @@ MIN_BLUR_SCORE = 25.0
 _MIN_SHARP = 20
 _MIN_SHARP_SHARE = 0.5
 _KEYFRAMES = "keyframes/"
+_MILLIMETRE = 0.001
+_CONFIDENT = 200
+"""Of 0, 127 and 255 the last, with room for what an app might call it."""
 
 
 def claims(listing: Listing) -> Claim | None:
@@ -60,11 +70,18 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         )
     if not pairs:
         raise missing("The export has pictures, but no camera file belongs to any of them.")
+    depths = _depths(archive, root, [image for image, _ in pairs], warnings)
     blurs: dict[str, float | None] = {}
     sources, failures = each_frame(
-        archive, dict(pairs), lambda image, camera: _frame(archive, image, camera, blurs)
+        archive,
+        dict(pairs),
+        lambda image, camera: _frame(archive, image, camera, blurs, depths.get(image)),
     )
-    _set_aside(archive, root, corrected, {name for pair in pairs for name in pair})
+    paired = {name for pair in pairs for name in pair}
+    _set_aside(archive, root, corrected, paired, depths)
+    of_frames = {name for source in sources for name in source.depth_files}
+    of_all = {name for depth in depths.values() for name in depth.files}
+    archive.set_aside(of_all - of_frames, "their pictures are left out")
     return PosedPictures(
         sources=_sharp(archive, sources, blurs, warnings),
         failures=failures,
@@ -80,12 +97,49 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     )
 
 
-def _set_aside(archive: CaptureArchive, root: str, corrected: bool, paired: set[str]) -> None:
+def _depths(
+    archive: CaptureArchive, root: str, images: list[str], warnings: list[str]
+) -> dict[str, SensorDepth]:
+    """The depth of each picture that has any, with its confidence; gaps go into `warnings`."""
+
+    def by_stem(folder: str) -> dict[str, str]:
+        whole = f"{root}{_KEYFRAMES}{folder}"
+        return {PurePosixPath(name).stem: name for name in archive.names if _folder(name) == whole}
+
+    maps, ratings = by_stem("depth"), by_stem("confidence")
+    stems = {image: PurePosixPath(image).stem for image in images}
+    found = {
+        image: SensorDepth(maps[stem], _MILLIMETRE, ratings.get(stem), _CONFIDENT)
+        for image, stem in stems.items()
+        if stem in maps
+    }
+    lost = [image for image in images if image not in found]
+    unrated = [depth.name for depth in found.values() if depth.confidence is None]
+    if found and lost:
+        warnings.append(
+            f"{len(lost)} of {len(images)} pictures have no depth map: {some_of(lost)}."
+        )
+    if unrated:
+        warnings.append(
+            f"{len(unrated)} of {len(found)} depth maps have no confidence map, and are used "
+            f"whole: {some_of(unrated)}."
+        )
+    return found
+
+
+def _set_aside(
+    archive: CaptureArchive,
+    root: str,
+    corrected: bool,
+    paired: set[str],
+    depths: Mapping[str, SensorDepth],
+) -> None:
     """Say of the export's files beside the paired ones why they are not used."""
+    paired = paired | {name for depth in depths.values() for name in depth.files}
     taken = ("corrected_images", "corrected_cameras") if corrected else ("images", "cameras")
     whys = {
-        "depth": "the phone's depth is not read",
-        "confidence": "the phone's depth is not read",
+        "depth": "no picture that is used goes with them",
+        "confidence": "no depth map that is used goes with them",
         "images": "corrected ones are taken instead",
         "cameras": "corrected ones are taken instead",
         taken[0]: "without a camera file",
@@ -117,7 +171,11 @@ def _folder(name: str) -> str:
 
 
 def _frame(
-    archive: CaptureArchive, image: str, camera: str, blurs: dict[str, float | None]
+    archive: CaptureArchive,
+    image: str,
+    camera: str,
+    blurs: dict[str, float | None],
+    depth: SensorDepth | None,
 ) -> PosedSource:
     """A keyframe; its blur score, where it has one (low = blurred), goes into `blurs`."""
     what = f'"{shown(camera)}"'
@@ -146,6 +204,7 @@ def _frame(
         lens=partial(resized, lens),
         world_from_camera=z_up_from_y_up(pose),
         timestamp_s=int(stem) * 1e-6 if stem.isascii() and stem.isdigit() else None,
+        depth=depth,
     )
 
 
@@ -162,9 +221,11 @@ def _sharp(
         return blur is not None and blur < MIN_BLUR_SCORE
 
     sharp = [source for source in sources if not is_blurred(source)]
-    blurred = [source.name for source in sources if is_blurred(source)]
+    blurred = [source for source in sources if is_blurred(source)]
     if len(sharp) >= max(_MIN_SHARP, _MIN_SHARP_SHARE * len(sources)):
-        archive.set_aside(blurred, "blurred")
+        archive.set_aside([source.name for source in blurred], "blurred")
+        of_blurred = [name for source in blurred for name in source.depth_files]
+        archive.set_aside(of_blurred, "their pictures are blurred")
         return sharp
     if blurred:
         warnings.append(

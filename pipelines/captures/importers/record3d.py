@@ -1,20 +1,23 @@
-"""A Record3D export: "EXR + RGB" (`metadata.json`, `rgb/<n>.jpg`) or `.r3d` (`metadata`, `rgbd/`).
+"""A Record3D export: "EXR + JPG" (`metadata.json`, `rgb/<n>.jpg`) or `.r3d` (`metadata`, `rgbd/`).
 
 Frame number n belongs to `poses[n]`, whichever files are there; names sort as numbers. `K` is
 column-major (fx 0 0 0 fy 0 cx cy 1), `perFrameIntrinsicCoeffs[n]` is (fx, fy, cx, cy), poses are
 (qx, qy, qz, qw, tx, ty, tz), world_from_camera, OpenGL camera, ARKit's world (+Y up, metres).
+
+The export's `depth/<n>.exr` holds metres along the camera's axis in its R channel, and comes
+without confidence. That of an `.r3d` (`.depth`, `.conf`) is packed with LZFSE, and not read.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import PurePosixPath
 from typing import Any
 
-from pipelines.captures.contents import PosedPictures, PosedSource, Rows
+from pipelines.captures.contents import PosedPictures, PosedSource, Rows, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.parsing import (
     each_frame,
@@ -31,6 +34,9 @@ from pipelines.scene.cameras_file import Intrinsics
 
 _LAYOUTS = (("metadata.json", "rgb/"), ("metadata", "rgbd/"))
 """The file of poses and the folder of pictures beside it: of an export, and of an .r3d file."""
+
+_DEPTH_FOLDER = "depth"
+_METRE = 1.0
 
 
 def claims(listing: Listing) -> Claim | None:
@@ -57,17 +63,19 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     poses = metadata.get("poses")
     if not isinstance(poses, list) or not poses:
         raise missing("The export's metadata has no poses.")
-    files = _numbered(archive, root + folder.rstrip("/"))
+    files = _numbered(archive.images, root + folder.rstrip("/"))
+    depths = _numbered(
+        (name for name in archive.names if name.endswith(".exr")), f"{root}{_DEPTH_FOLDER}"
+    )
     usable = sorted(n for n in files if n < len(poses))
     if not usable:
         raise missing("No picture of the export has a pose: their numbers do not meet.")
-    depth = [name for name in archive.names if name.endswith((".exr", ".depth", ".conf"))]
-    archive.set_aside(depth, "the phone's depth is not read")
     sources, failures = each_frame(
         archive,
         {files[n]: n for n in usable},
-        lambda name, n: _source(name, n, metadata, poses),
+        lambda name, n: _source(name, n, metadata, poses, depths.get(n)),
     )
+    _set_aside(archive, sources, {depths[n] for n in usable if n in depths})
     return PosedPictures(
         sources=sources,
         failures=failures,
@@ -75,14 +83,34 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         is_dense=True,
         notes={"world": "ARKit, turned to +Z up"},
         details={"num_poses": len(poses), "num_frames": len(files)},
-        warnings=_gaps(files, len(poses)),
+        warnings=_gaps(files, len(poses)) + _without_depth(usable, depths),
     )
 
 
-def _numbered(archive: CaptureArchive, folder: str) -> dict[int, str]:
-    """The pictures by their number; copies such as `123(3).jpg` are no frames."""
+def _set_aside(archive: CaptureArchive, sources: Sequence[PosedSource], paired: set[str]) -> None:
+    """Say of depth beside that of the sources why it is not used."""
+    packed = [name for name in archive.names if name.endswith((".depth", ".conf"))]
+    archive.set_aside(
+        packed, 'depth packed with LZFSE (.r3d) is not read; the export "EXR + JPG" brings it'
+    )
+    others = [name for name in archive.names - paired if name.endswith(".exr")]
+    archive.set_aside(others, "no picture that is used goes with them")
+    kept = {name for source in sources for name in source.depth_files}
+    archive.set_aside(paired - kept, "their pictures are left out")
+
+
+def _without_depth(usable: Sequence[int], depths: dict[int, str]) -> list[str]:
+    """A warning where some pictures have depth, and others have none."""
+    lost = [str(n) for n in usable if n not in depths]
+    if not lost or len(lost) == len(usable):
+        return []
+    return [f"{len(lost)} of {len(usable)} pictures have no depth map: {some_of(lost)}."]
+
+
+def _numbered(names: Iterable[str], folder: str) -> dict[int, str]:
+    """The files of a folder by their number; copies such as `123(3).jpg` are no frames."""
     found: dict[int, str] = {}
-    for name in archive.images:
+    for name in names:
         path = PurePosixPath(name)
         if str(path.parent) == folder and re.fullmatch(r"[0-9]{1,9}", path.stem):
             found[int(path.stem)] = name
@@ -100,7 +128,9 @@ def _gaps(files: dict[int, str], num_poses: int) -> list[str]:
     return warnings
 
 
-def _source(name: str, n: int, metadata: dict[str, Any], poses: list[Any]) -> PosedSource:
+def _source(
+    name: str, n: int, metadata: dict[str, Any], poses: list[Any], depth: str | None
+) -> PosedSource:
     what = f"frame {n}"
     qx, qy, qz, qw, *position = numbers(poses[n], 7, f"The pose of {what}")
     rotation = _rotation((qx, qy, qz, qw), what)
@@ -114,6 +144,7 @@ def _source(name: str, n: int, metadata: dict[str, Any], poses: list[Any]) -> Po
         lens=partial(resized, _lens(n, metadata)),
         world_from_camera=z_up_from_y_up(pose),
         timestamp_s=timestamp,
+        depth=None if depth is None else SensorDepth(depth, _METRE),
     )
 
 

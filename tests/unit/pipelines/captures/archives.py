@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import PIL.Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -30,6 +32,23 @@ def picture(
     stream = io.BytesIO()
     PIL.Image.fromarray(pixels).save(stream, kind, **save)
     return stream.getvalue()
+
+
+def depth_png(counts: Any) -> bytes:
+    """Numbers [h, w] as a PNG of one channel: 8 bits for uint8, 16 for uint16."""
+    stream = io.BytesIO()
+    PIL.Image.fromarray(np.asarray(counts)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def depth_exr(values: Any, channel: str = "R", **more: Any) -> bytes:
+    """Numbers [h, w] as an OpenEXR of half floats and ZIP, as Record3D writes it."""
+    channels = {channel: np.asarray(values, np.float16), **more}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "depth.exr"
+        OpenEXR.File(header, channels).write(str(path))
+        return path.read_bytes()
 
 
 def phone_exif(focal_mm: float, focal_35mm: int, orientation: int = 1) -> PIL.Image.Exif:

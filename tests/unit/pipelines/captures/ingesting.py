@@ -7,11 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipelines.errors import CaptureError
 from pipelines.options import IngestOptions
 from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.stage import StageContext
 from pipelines.stages.ingest import run
 from tests.unit.pipelines.captures.archives import context, write_zip
@@ -50,6 +53,11 @@ def code_of(
 def cameras(ctx: StageContext) -> CamerasFile:
     """The poses that the stage wrote."""
     return CamerasFile.load(ctx.out / "cameras.json")
+
+
+def depth_of(ctx: StageContext, index: int) -> NDArray[np.float32]:
+    """The depth that the stage wrote beside picture `index`."""
+    return load_sensor_depth(ctx.out / str(cameras(ctx).images[index].depth))
 
 
 def sources(ctx: StageContext) -> list[str]:

@@ -14,6 +14,7 @@ import pytest
 from pipelines.captures.sniff import sniff
 from pipelines.manifest import run_job_locally
 from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.captures.archives import write_zip
 
@@ -126,6 +127,22 @@ def test_sceaux_photos_lose_their_exif(tmp_path: Path) -> None:
             assert not image.getexif()
 
 
+def test_office_keeps_the_depth_of_its_sensor(tmp_path: Path) -> None:
+    folder = captures() / "rgbd-hololens-office"
+    source = zip_of(tmp_path / "office.zip", folder, [p for p in folder.rglob("*") if p.is_file()])
+    workspace, summary = prepared(tmp_path, source)
+    assert (summary["kind"], summary["num_images"], summary["num_depths"]) == ("nerfstudio", 94, 94)
+    images = CamerasFile.load(workspace.posed_cameras).images
+    depths = [load_sensor_depth(workspace.images_root / str(image.depth)) for image in images]
+    for z, path in zip(depths, sorted((folder / "depth").iterdir()), strict=True):
+        with PIL.Image.open(path) as counts:
+            np.testing.assert_allclose(z, np.asarray(counts) * 0.001, rtol=1e-6)
+    # The sensor sees rings and what is far off not at all: 40 to 81 % of a frame are known.
+    known = np.array([(z > 0).mean() for z in depths])
+    assert 0.4 < known.min() < known.max() < 0.82
+    assert 0.59 < np.median(known) < 0.78
+
+
 def test_door_handle_skips_the_frame_that_is_missing(tmp_path: Path) -> None:
     folder = captures() / "record3d-door-handle-first100"
     source = zip_of(tmp_path / "door.zip", folder, [p for p in folder.rglob("*") if p.is_file()])
@@ -139,5 +156,11 @@ def test_door_handle_skips_the_frame_that_is_missing(tmp_path: Path) -> None:
     centers = np.array([[row[3] for row in image.world_from_camera] for image in file.images])
     expected = np.array([[poses[n][6], poses[n][4], poses[n][5]] for n in numbers])
     np.testing.assert_allclose(centers, expected, atol=1e-9)
+    assert summary["num_depths"] == 99
+    for image in file.images:
+        z = load_sensor_depth(workspace.images_root / str(image.depth))
+        assert z.shape == (256, 192)
+        assert (z > 0).mean() > 0.99
+        assert 0.1 < np.median(z) < 1.0
     # The pictures show the floor at their lower edge: a camera's up is the world's up.
     assert all(image.world_from_camera[2][1] > 0.5 for image in file.images)

@@ -19,7 +19,7 @@ from pipelines.sample.scene import depth_image, pixel_rays, pose_matrix, raycast
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
-from pipelines.stages.assess import DEPTH_UNIT_NOTE
+from pipelines.scene.sensor_depth import save_sensor_depth
 from pipelines.workspace import MANIFEST, Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -169,24 +169,23 @@ def test_floaters_that_were_not_measured_leave_coverage_to_judge(job: Workspace)
     assert assets["warnings"] == []
 
 
-def _with_depth(job: Workspace, unit: float) -> None:
-    """Give every image exact depth in 16 bits."""
+def _with_depth(job: Workspace) -> None:
+    """Give every image exact depth."""
     path = job.stage("train") / "cameras.json"
     cameras = CamerasFile.load(path)
     (job.images_root / "depth").mkdir()
     images = []
     for number, image in enumerate(cameras.images):
         depth = depth_image(cameras.cameras[0], pose_matrix(image))
-        file = f"depth/{number:05d}.png"
-        Image.fromarray(np.rint(depth / unit).astype(np.uint16)).save(job.images_root / file)
+        file = f"depth/{number:05d}.npz"
+        save_sensor_depth(job.images_root / file, depth.astype(np.float32))
         images.append(replace(image, depth=file))
-    notes = {**cameras.notes, DEPTH_UNIT_NOTE: unit}
-    replace(cameras, images=tuple(images), notes=notes).save(path)
+    replace(cameras, images=tuple(images)).save(path)
 
 
 def test_the_mesh_is_compared_with_the_captures_own_depth(job: Workspace) -> None:
     _exact_assets(job)
-    _with_depth(job, unit=0.0005)
+    _with_depth(job)
     assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
     assert assets["depth_reason"] is None
     depth = assets["depth"]
@@ -198,14 +197,14 @@ def test_the_mesh_is_compared_with_the_captures_own_depth(job: Workspace) -> Non
     )
 
 
-def test_a_damaged_depth_picture_costs_the_comparison_and_not_the_job(job: Workspace) -> None:
+def test_a_damaged_depth_map_costs_the_comparison_and_not_the_job(job: Workspace) -> None:
     _exact_assets(job)
-    _with_depth(job, unit=0.001)
+    _with_depth(job)
     for path in (job.images_root / "depth").iterdir():
-        path.write_bytes(b"no picture")
+        path.write_bytes(b"no map")
     assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
     assert assets["depth"] is None
-    assert "no depth picture" in assets["depth_reason"]
+    assert "no depth map" in assets["depth_reason"]
 
 
 def test_a_mask_leaves_its_pixels_out(job: Workspace) -> None:

@@ -12,10 +12,19 @@ import PIL.Image
 import pytest
 
 from pipelines.errors import CaptureError
-from tests.unit.pipelines.captures.archives import exif, nerfstudio_files, picture, pose, red_corner
+from tests.unit.pipelines.captures.archives import (
+    depth_exr,
+    depth_png,
+    exif,
+    nerfstudio_files,
+    picture,
+    pose,
+    red_corner,
+)
 from tests.unit.pipelines.captures.ingesting import (
     cameras,
     code_of,
+    depth_of,
     failure,
     ingest,
     sources,
@@ -253,28 +262,138 @@ def test_picture_listed_twice_keeps_its_first_pose_and_is_told(tmp_path: Path) -
 
 
 def test_what_the_file_says_and_nobody_heeds_is_told(tmp_path: Path) -> None:
-    depth = io.BytesIO()
-    PIL.Image.fromarray(np.zeros((48, 64), np.uint16)).save(depth, "PNG")
-    frames = frames_of(4)
-    for n, frame in enumerate(frames):
-        frame["depth_file_path"] = f"depth/{n}.png"
     top = {
         "train_filenames": ["images/0.jpg"],
         "ply_file_path": "sparse_pc.ply",
         "orientation_override": "none",
     }
-    files = nerfstudio_files(frames=frames, **top) | {"sparse_pc.ply": "ply"}
-    files |= {f"depth/{n}.png": depth.getvalue() for n in range(4)}
+    files = nerfstudio_files(**top) | {"sparse_pc.ply": "ply"}
     files |= {f"images_2/{n}.jpg": picture(32, 24, seed=n) for n in range(4)}
     summary, ctx = ingest(tmp_path, files)
     assert len(cameras(ctx).images) == 4
     for words in (
-        ("4 depth maps",),
         ("names a point cloud",),
         ("hold out",),
         ("orientation_override",),
-        ("4 pictures in depth/", "depth is not read"),
         ("4 pictures in images_2/", "not listed"),
         ("(sparse_pc.ply)", "point clouds are not read"),
     ):
         assert warning_with(summary, *words)
+
+
+# --- depth ----------------------------------------------------------------------------------
+
+
+COUNTS = np.arange(12 * 16, dtype=np.uint16).reshape(12, 16) * 300
+"""Depth at a quarter of the pictures' size; the first count, 0, is unknown."""
+
+
+def with_depth(count: int = 4, **top: Any) -> dict[str, bytes | str]:
+    frames = frames_of(count)
+    for n, frame in enumerate(frames):
+        frame["depth_file_path"] = f"depth/{n}.png"
+    files = nerfstudio_files(count, **({"frames": frames} | top))
+    return files | {f"depth/{n}.png": depth_png(COUNTS) for n in range(count)}
+
+
+def test_depth_is_kept_in_the_poses_unit(tmp_path: Path) -> None:
+    summary, ctx = ingest(tmp_path, with_depth())
+    file = cameras(ctx)
+    assert [image.depth for image in file.images] == [f"depth/{n:05d}.npz" for n in range(1, 5)]
+    assert (summary["num_depths"], summary["warnings"], file.metric) == (4, [], False)
+    assert summary["num_unlisted"] == 0
+    z = depth_of(ctx, 2)
+    assert (z.dtype, z.shape) == (np.float32, (12, 16))
+    np.testing.assert_allclose(z, COUNTS * 0.001, rtol=1e-6)
+    assert not list(ctx.out.glob(".raw*"))
+
+
+def test_depth_unit_and_applied_scale_multiply_and_a_frame_has_its_own(tmp_path: Path) -> None:
+    """As nerfstudio does: depth is in the original world's unit, poses are in the file's."""
+    frames = frames_of(4)
+    for n, frame in enumerate(frames):
+        frame["depth_file_path"] = f"depth/{n}.png"
+    frames[1]["depth_unit_scale_factor"] = 0.5
+    top = {"frames": frames, "depth_unit_scale_factor": 0.01, "applied_scale": 0.25}
+    _, ctx = ingest(tmp_path, with_depth(**top))
+    np.testing.assert_allclose(depth_of(ctx, 0), COUNTS * 0.0025, rtol=1e-6)
+    np.testing.assert_allclose(depth_of(ctx, 1), COUNTS * 0.125, rtol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [0, -0.001, "mm", None, True, 1e999])
+def test_depth_in_no_unit_is_not_used_and_told(tmp_path: Path, unit: Any) -> None:
+    summary, ctx = ingest(tmp_path, with_depth(depth_unit_scale_factor=unit))
+    assert [image.depth for image in cameras(ctx).images] == [None] * 4
+    assert not (ctx.out / "depth").exists()
+    (told,) = summary["warnings"]
+    assert told.startswith("4 depth maps are not used")
+
+
+def test_depth_that_is_not_there_is_told_and_its_picture_kept(tmp_path: Path) -> None:
+    files = with_depth()
+    del files["depth/1.png"], files["depth/3.png"]
+    summary, ctx = ingest(tmp_path, files)
+    assert [bool(image.depth) for image in cameras(ctx).images] == [True, False, True, False]
+    assert "depth/1.png, depth/3.png" in warning_with(summary, "2 of 4 depth maps", "not in the")
+
+
+def test_depth_on_another_machine_is_matched_but_never_with_a_picture(tmp_path: Path) -> None:
+    frames = frames_of(4)
+    for n, frame in enumerate(frames):
+        frame["depth_file_path"] = f"/home/somebody/depth/{n}.png"
+    frames[3]["depth_file_path"] = "z/3.jpg"
+    files = with_depth(frames=frames)
+    summary, ctx = ingest(tmp_path, files)
+    assert [bool(image.depth) for image in cameras(ctx).images] == [True, True, True, False]
+    assert warning_with(summary, "3 depth maps", "end of the name")
+    assert warning_with(summary, "1 of 4 depth maps", "z/3.jpg")
+
+
+UNUSABLE = {
+    "is neither": b"\x93NUMPY" + bytes(60),
+    "does not decode": depth_png(COUNTS)[:90],
+    "8 bits": depth_png(np.full((12, 16), 9, np.uint8)),
+    "colours": picture(16, 12, kind="PNG"),
+    "is 9x12, its picture 64x48: not": depth_png(COUNTS[:, :9]),
+    "can be trusted": depth_png(np.zeros((12, 16), np.uint16)),
+}
+
+
+@pytest.mark.parametrize("why", UNUSABLE)
+def test_depth_that_cannot_be_used_costs_no_picture(tmp_path: Path, why: str) -> None:
+    files = with_depth()
+    files["depth/2.png"] = UNUSABLE[why]
+    summary, ctx = ingest(tmp_path, files)
+    assert [bool(image.depth) for image in cameras(ctx).images] == [True, True, False, True]
+    assert why in warning_with(summary, "1 of 4 depth maps cannot be used", "depth/2.png")
+    assert len(summary["warnings"]) == 1
+    assert {path.name for path in (ctx.out / "depth").iterdir()} == {
+        "00001.npz", "00002.npz", "00004.npz",
+    }  # fmt: skip
+
+
+def test_depth_of_a_frame_that_is_left_out_is_left_with_it(tmp_path: Path) -> None:
+    frames = frames_of(12)
+    for n, frame in enumerate(frames):
+        frame["depth_file_path"] = f"depth/{n}.png"
+    frames[3]["transform_matrix"] = SHEARED
+    summary, ctx = ingest(tmp_path, with_depth(12, frames=frames))
+    assert summary["num_depths"] == 11
+    assert len(list((ctx.out / "depth").iterdir())) == 11
+    assert warning_with(summary, "(depth/3.png)", "their pictures are left out")
+
+
+def test_depth_whose_picture_is_not_there_is_listed_all_the_same(tmp_path: Path) -> None:
+    files = with_depth(6)
+    del files["images/1.jpg"]
+    summary, _ = ingest(tmp_path, files)
+    assert (summary["num_depths"], summary["num_missing"], summary["num_unlisted"]) == (5, 1, 0)
+    assert warning_with(summary, "(depth/1.png)", "their pictures are left out")
+
+
+def test_depth_in_openexr_and_of_the_cameras_size(tmp_path: Path) -> None:
+    frames = frames_of(4, depth_file_path="z.exr", depth_unit_scale_factor=1.0)
+    values = np.linspace(0.5, 4.0, 48 * 64).reshape(48, 64)
+    files = nerfstudio_files(frames=frames) | {"z.exr": depth_exr(values)}
+    _, ctx = ingest(tmp_path, files)
+    np.testing.assert_allclose(depth_of(ctx, 3), values, rtol=1e-3)

@@ -1,0 +1,184 @@
+"""Depth that a phone's sensor measured, out of an archive: decoded, checked, in world units.
+
+Read are pictures of one channel and 16 bits in PNG, and the R channel of OpenEXR (Record3D's), and
+nothing else. What is not finite, not above 0 or not trusted becomes 0, unknown. A map that cannot
+be used never costs its picture: it is left out and told.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.captures.archive_rules import shown
+from pipelines.captures.contents import SensorDepth
+from pipelines.captures.magic import image_format, is_exr
+from pipelines.captures.parsing import some_of
+from pipelines.captures.pictures import opened
+from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
+from pipelines.scene.sensor_depth import Depths, save_sensor_depth
+
+_FOLDER = "depth"
+_ASPECT_SLACK = 0.02
+_MOST_CHANNELS = 4
+_ONE_CHANNEL = ("L", "I", "I;16", "I;16L", "I;16B", "I;16N")
+"""Pillow's modes of pictures with one channel of numbers, of 8 bits or 16."""
+
+
+class DepthWriter:
+    """Writes depth maps of one archive to `out/depth`."""
+
+    def __init__(self, archive: CaptureArchive, out: Path, *, max_pixels: int) -> None:
+        self._archive = archive
+        self._out = out
+        self._max_pixels = max_pixels
+        self._raw = out / ".raw_depth"
+        self._num_tried = 0
+        self._refused: dict[str, CaptureError] = {}
+        (out / _FOLDER).mkdir(parents=True, exist_ok=True)
+
+    def close(self) -> None:
+        """Remove what was only needed while writing."""
+        self._raw.unlink(missing_ok=True)
+        if not any((self._out / _FOLDER).iterdir()):
+            (self._out / _FOLDER).rmdir()
+
+    def store(self, depth: SensorDepth, number: int, size: tuple[int, int]) -> str | None:
+        """Write the depth of picture `number`; returns its path below `out`.
+
+        size: width and height of the picture. A map that cannot be used is remembered for
+        `warnings`, and None is returned.
+        """
+        self._num_tried += 1
+        try:
+            z = self.read(depth, size)
+        except CaptureError as error:
+            if error.code != "image_undecodable":
+                raise
+            self._refused[depth.name] = error
+            self._archive.told(depth.files)
+            return None
+        file = f"{_FOLDER}/{number:05d}.npz"
+        save_sensor_depth(self._out / file, z)
+        return file
+
+    def read(self, depth: SensorDepth, size: tuple[int, int]) -> Depths:
+        """[h, w] in world units along the camera's axis, 0 for unknown; size as for `store`.
+
+        Raises CaptureError image_undecodable, also where the map's aspect is not the picture's
+        (portrait taken for landscape, or a picture that was cut) or nothing of it is known.
+        """
+        values = self._values(depth.name)
+        height, width = values.shape
+        if abs(width * size[1] / (height * size[0]) - 1) > _ASPECT_SLACK:
+            raise _unusable(
+                depth.name,
+                f"is {width}x{height}, its picture {size[0]}x{size[1]}: not the same view",
+            )
+        with np.errstate(over="ignore", invalid="ignore"):
+            z = (values.astype(np.float64) * depth.unit).astype(np.float32)
+            known = np.isfinite(z) & (z > 0)
+        if depth.confidence is not None:
+            known &= self._confidence(depth.confidence, values.shape) >= depth.least_confidence
+        if not known.any():
+            raise _unusable(depth.name, "has no value that can be trusted")
+        return np.where(known, z, np.float32(0.0))
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be told about the maps so far."""
+        if not self._refused:
+            return []
+        first = next(iter(self._refused.values())).message
+        return [
+            f"{len(self._refused)} of {self._num_tried} depth maps cannot be used, and their "
+            f"pictures are used without: {some_of(self._refused)}. {first}"
+        ]
+
+    def _values(self, name: str) -> NDArray[Any]:
+        """What a file stores, [h, w], of any unit."""
+        head = self._archive.head(name)
+        if is_exr(head):
+            self._archive.extract(name, self._raw)
+            return _exr_channel(self._raw, name, self._max_pixels)
+        values = self._one_channel(name)
+        if values.itemsize == 1:
+            raise _unusable(name, "has 8 bits; 16 are needed")
+        return values
+
+    def _confidence(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        values = self._one_channel(name)
+        if values.shape != shape:
+            raise _unusable(
+                name,
+                f"is {values.shape[1]}x{values.shape[0]}, the depth map that it is for "
+                f"{shape[1]}x{shape[0]}",
+            )
+        return values
+
+    def _one_channel(self, name: str) -> NDArray[Any]:
+        """A PNG of one channel, [h, w]."""
+        if image_format(self._archive.head(name)) != "PNG":
+            raise _unusable(name, "is neither a PNG nor OpenEXR")
+        self._archive.extract(name, self._raw)
+        with opened(self._raw, name, "PNG", self._max_pixels) as image:
+            if image.mode not in _ONE_CHANNEL:
+                raise _unusable(name, f"has colours ({image.mode}) in place of one channel")
+            return np.asarray(image)
+
+
+def _exr_channel(path: Path, name: str, max_pixels: int) -> NDArray[Any]:
+    """The R channel of an OpenEXR file, [h, w].
+
+    The headers are looked at before any pixel: size, one plain image, few channels. A damaged part
+    is left out by the library, with a line on stdout, and no part is left then.
+    """
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True, num_threads=0) as file:
+            why = _exr_fault(file.parts, max_pixels)
+        if why:
+            raise _unusable(name, why)
+        # Without `separate_channels` R, G and B would come as one array.
+        with OpenEXR.File(str(path), separate_channels=True, num_threads=0) as file:
+            pixels = np.array(file.channels()["R"].pixels)
+    except (RuntimeError, ValueError, TypeError, LookupError, OSError, OpenEXR.error) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the disk's fault, not the file's
+        raise _unusable(name, "does not decode") from error
+    if pixels.ndim != 2 or pixels.dtype.kind != "f":
+        raise _unusable(name, "has no channel R of plain numbers")
+    return pixels
+
+
+def _exr_fault(parts: list[Any], max_pixels: int) -> str:
+    """Why a file with these parts is not read, by its headers; "" where it is."""
+    import OpenEXR
+
+    if len(parts) != 1:
+        return f"has {len(parts)} images"
+    header = parts[0].header
+    if header.get("type", OpenEXR.scanlineimage) != OpenEXR.scanlineimage:
+        return "is tiled or deep"
+    channels = header["channels"]
+    red = [item for item in channels if item.name == "R"]
+    if len(channels) > _MOST_CHANNELS or not red or (red[0].xSampling, red[0].ySampling) != (1, 1):
+        return "has no channel R of plain numbers"
+    (left, top), (right, bottom) = ([int(value) for value in row] for row in header["dataWindow"])
+    width, height = right - left + 1, bottom - top + 1
+    if width < 1 or height < 1 or width * height > max_pixels:
+        return f"has {width}x{height} pixels; {max_pixels} are allowed"
+    return ""
+
+
+def _unusable(name: str, why: str) -> CaptureError:
+    return CaptureError(
+        f'"{shown(name)}" {why}.',
+        code="image_undecodable",
+        hint="Export the capture again, or leave its depth out; pictures are used without.",
+    )

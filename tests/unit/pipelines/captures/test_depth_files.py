@@ -1,0 +1,207 @@
+"""Depth of a sensor: numbers as they were sent, damage refused by name, no picture lost by it."""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from pipelines.captures.archive_rules import ArchiveLimits
+from pipelines.captures.contents import SensorDepth
+from pipelines.captures.depth_files import DepthWriter
+from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
+from pipelines.options import IngestOptions
+from pipelines.sample.scene import depth_image, pose_matrix
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.sensor_depth import load_sensor_depth
+from pipelines.stages.ingest import run
+from tests.capture_writers import reduced, write_nerfstudio, write_polycam, write_record3d
+from tests.unit.pipelines.captures.archives import context, depth_exr, depth_png, write_zip
+
+SIZE = (64, 48)
+
+
+@contextmanager
+def writer_of(tmp_path: Path, **files: bytes) -> Iterator[DepthWriter]:
+    tmp_path.mkdir(exist_ok=True)
+    path = write_zip(tmp_path / "c.zip", files)
+    with CaptureArchive(path, ArchiveLimits()) as archive:
+        yield DepthWriter(archive, tmp_path / "out", max_pixels=100_000)
+
+
+def read(tmp_path: Path, depth: bytes, confidence: bytes | None = None, least: int = 0) -> Any:
+    files = {"d": depth} if confidence is None else {"d": depth, "c": confidence}
+    with writer_of(tmp_path, **files) as writer:
+        rated = None if confidence is None else "c"
+        return writer.read(SensorDepth("d", 0.001, rated, least), SIZE)
+
+
+def test_counts_of_16_bits_become_units(tmp_path: Path) -> None:
+    counts = np.random.default_rng(3).integers(0, 65536, (48, 64), np.uint16)
+    z = read(tmp_path, depth_png(counts))
+    assert z.dtype == np.float32
+    np.testing.assert_allclose(z, counts * 0.001, rtol=1e-6)
+
+
+def test_what_is_not_known_or_not_trusted_is_0(tmp_path: Path) -> None:
+    values = np.ones((48, 64))
+    values[0, :5] = [0.0, -2.0, np.nan, np.inf, -np.inf]
+    confidence = np.full((48, 64), 2, np.uint8)
+    confidence[1, 0], confidence[1, 1] = 1, 0
+    z = read(tmp_path, depth_exr(values), depth_png(confidence), 2)
+    known = np.ones((48, 64), bool)
+    known[0, :5] = known[1, :2] = False
+    np.testing.assert_array_equal(z, np.where(known, np.float32(0.001), 0))
+
+
+@pytest.mark.parametrize(("width", "fits"), [(64, True), (65, True), (63, True), (66, False)])
+def test_aspect_may_differ_by_two_percent(tmp_path: Path, width: int, fits: bool) -> None:
+    depth = depth_png(np.ones((48, width), np.uint16))
+    if fits:
+        assert read(tmp_path, depth).shape == (48, width)
+    else:
+        with pytest.raises(CaptureError, match="66x48, its picture 64x48: not the same view"):
+            read(tmp_path, depth)
+
+
+def test_a_unit_beyond_all_numbers_leaves_nothing(tmp_path: Path) -> None:
+    counts = depth_png(np.ones((48, 64), np.uint16))
+    with (
+        writer_of(tmp_path, d=counts) as writer,
+        pytest.raises(CaptureError, match="can be trusted"),
+    ):
+        writer.read(SensorDepth("d", 1e300), SIZE)
+
+
+def test_writer_tells_what_it_refused_and_removes_an_empty_folder(tmp_path: Path) -> None:
+    with writer_of(tmp_path, a=b"text", b=depth_png(np.zeros((48, 64), np.uint16))) as writer:
+        assert [writer.store(SensorDepth(name, 1.0), 1, SIZE) for name in "ab"] == [None, None]
+        writer.close()
+        (told,) = writer.warnings
+    assert "2 of 2 depth maps cannot be used" in told
+    assert '"a" is neither a PNG nor OpenEXR' in told
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def _boxed(data: bytes, *box: int) -> bytes:
+    """An OpenEXR whose header says another data window."""
+    changed = bytearray(data)
+    struct.pack_into("<4i", changed, data.index(b"dataWindow\0box2i\0") + 21, *box)
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        (0, 0, 100_000, 100_000),
+        (0, 0, 191, 40_000_000),
+        (0, 0, 2**30, 255),
+        (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1),
+        (0, 0, -1, -1),
+        (0, 0, 128, 47),
+    ],
+)
+def test_openexr_of_an_absurd_size_is_refused_before_it_is_read(
+    tmp_path: Path, box: tuple[int, int, int, int]
+) -> None:
+    with pytest.raises(CaptureError) as caught:
+        read(tmp_path, _boxed(depth_exr(np.ones((48, 64))), *box))
+    assert caught.value.code == "image_undecodable"
+    assert '"d"' in caught.value.message
+    assert caught.value.hint
+
+
+def _several_parts() -> bytes:
+    parts = [OpenEXR.Part({}, {"R": np.ones((48, 64), np.float16)}, name) for name in "ab"]
+    return _written(OpenEXR.File(parts))
+
+
+def _tiled() -> bytes:
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 16
+    header = {"type": OpenEXR.tiledimage, "tiles": tiles}
+    return _written(OpenEXR.File(header, {"R": np.ones((48, 64), np.float16)}))
+
+
+def _of_integers() -> bytes:
+    return _written(OpenEXR.File({}, {"R": np.ones((48, 64), np.uint32)}))
+
+
+def _written(file: OpenEXR.File) -> bytes:
+    stream = io.BytesIO()
+    file.write(stream)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [(_several_parts, "2 images"), (_tiled, "tiled"), (_of_integers, "no channel R of plain")],
+)
+def test_openexr_of_another_kind_is_refused(
+    tmp_path: Path, make: Callable[[], bytes], why: str
+) -> None:
+    with pytest.raises(CaptureError, match=why):
+        read(tmp_path, make())
+
+
+@pytest.mark.parametrize("kind", ["png", "exr"])
+def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path: Path, kind: str) -> None:
+    rng = random.Random(kind)
+    values = np.random.default_rng(0).uniform(0.5, 4.0, (48, 64))
+    whole = depth_exr(values) if kind == "exr" else depth_png((values * 1000).astype(np.uint16))
+    found: Counter[str] = Counter()
+    for n in range(200):
+        changed = bytearray(whole)
+        for _ in range(rng.randint(1, 5)):
+            place = rng.randrange(4, 400 if rng.random() < 0.6 else len(changed))
+            changed[place] = rng.choice([0, 1, 3, 0x7F, 0x80, 0xFF, rng.randrange(256)])
+        if rng.random() < 0.1:
+            del changed[rng.randrange(8, len(changed)) :]
+        try:
+            z = read(tmp_path / str(n), bytes(changed))
+        except CaptureError as error:
+            found[error.code if error.hint else "no hint"] += 1
+        else:
+            assert np.isfinite(z).all()
+            found["read"] += 1
+    assert set(found) <= {"read", "image_undecodable"}
+    assert found["image_undecodable"] > 50
+
+
+@pytest.mark.parametrize(
+    ("write", "given"),
+    [
+        (write_polycam, {}),
+        (write_record3d, {"depth": True}),
+        (write_nerfstudio, {"depth": True}),
+    ],
+)
+def test_depth_of_every_format_is_that_of_the_scene(
+    tmp_path: Path, write: Callable[..., CamerasFile], given: dict[str, bool]
+) -> None:
+    """Within half a millimetre, or half a step of a half float."""
+    ctx = context(tmp_path)
+    ctx.workspace.capture_file.parent.mkdir(parents=True)
+    truth = write(ctx.workspace.capture_file, num=8, **given)
+    run(IngestOptions(), ctx)
+    file = CamerasFile.load(ctx.out / "cameras.json")
+    assert len(file.images) == len(truth.images)
+    for image in file.images:
+        lens = reduced(file.cameras[image.camera])
+        exact = depth_image(lens, pose_matrix(image))
+        z = load_sensor_depth(ctx.out / str(image.depth))
+        assert z.shape == exact.shape
+        known = z > 0
+        assert known.mean() > 0.3
+        error = np.abs(z - exact)[known]
+        assert (error <= np.maximum(0.00051, exact[known] / 2000)).all()
