@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 
 from pipelines.captures.minimum import MIN_IMAGES, MIN_POSED_IMAGES
 from pipelines.exports.catalogue import EXPORTS, KINDS
-from pipelines.exports.options import ExtentOptions
+from pipelines.exports.options import ExtentOptions, TextureOptions
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.options.catalogue import find_method, methods
 from pipelines.nerf.options.evaluate import EvaluateConfig
@@ -139,7 +139,7 @@ class DepthOptions(model_of(StereoConfig)):  # type: ignore[misc]
     )
 
 
-class DraftOptions(ExtentOptions):
+class DraftOptions(ExtentOptions, TextureOptions):
     """The mesh from depth maps alone, before training."""
 
     resolution: int = Field(

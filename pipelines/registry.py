@@ -61,7 +61,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="depth",
-        version=1,
+        version=2,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.depth:run",
@@ -71,7 +71,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="draft",
-        version=1,
+        version=2,
         after=("depth",),
         reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.draft:run",
@@ -114,7 +114,7 @@ STAGES: tuple[Stage, ...] = (
     *(_export_stage(export) for export in EXPORTS),
     Stage(
         name="assess",
-        version=2,
+        version=3,
         after=("evaluate", "pointcloud", "mesh"),
         reads=("ingest", "frames", "poses", "depth", "train", "evaluate", "pointcloud", "mesh"),
         run="pipelines.stages.assess:run",

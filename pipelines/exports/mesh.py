@@ -23,6 +23,22 @@ class TriangleMesh:
     normals: Floats
 
 
+@dataclass(frozen=True)
+class TexturedMesh:
+    """A triangle mesh with a picture on it; a vertex is there once for each of its places in it.
+
+    vertices: [V, 3] world. faces: [F, 3] int32, counter-clockwise from outside. normals: [V, 3],
+    unit. uv: [V, 2] in [0, 1] from the texture's top left corner, right and down.
+    texture: [H, W, 3] uint8, sRGB.
+    """
+
+    vertices: Floats
+    faces: NDArray[np.int32]
+    normals: Floats
+    uv: Floats
+    texture: NDArray[np.uint8]
+
+
 def empty_mesh() -> TriangleMesh:
     """A mesh without vertices."""
     none = np.zeros((0, 3))

@@ -47,6 +47,19 @@ class ExtentOptions(StageOptions):
     )
 
 
+class TextureOptions(StageOptions):
+    """What a mesh is coloured with."""
+
+    texture: Literal["photos", "none"] = Field(
+        "photos",
+        description="photos puts a picture on the mesh, made of the training photos; none leaves "
+        "it its vertices' colours.",
+    )
+    texture_px: Literal[512, 1024, 2048, 4096, 8192] = Field(
+        4096, description="Largest side of that picture; it is no larger than the photos need."
+    )
+
+
 class CropOptions(RenderingOptions, ExtentOptions):
     """Common to mesh and point cloud."""
 

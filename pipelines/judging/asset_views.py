@@ -28,6 +28,8 @@ WIDEST_SPACING = 3.0
 MAX_RADIUS_PX = 6
 """A point is drawn at most this large: what is right before the camera must not hide the rest."""
 _MAX_ANGLE_ERROR = 0.02
+_TEXTURE_LEVELS = 4
+"""Farther copies would mix in what lies beside a patch."""
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
 _core: Any = open3d.core
@@ -53,21 +55,80 @@ class AssetView:
         return np.asarray(self.distance * along, np.float32)
 
 
+class Texture:
+    """A picture on a mesh, with smaller copies of it, as viewers look it up from afar.
+
+    uv: [V, 2] in [0, 1], from its top left corner. picture: [H, W, 3] uint8, sRGB.
+    """
+
+    def __init__(self, uv: Floats, picture: NDArray[np.uint8]) -> None:
+        self.uv = uv
+        self._levels = [np.asarray(picture, np.float32) / np.float32(255.0)]
+        while len(self._levels) < _TEXTURE_LEVELS and min(self._levels[-1].shape[:2]) > 2:
+            height, width = (side // 2 for side in self._levels[-1].shape[:2])
+            whole = self._levels[-1][: 2 * height, : 2 * width]
+            self._levels.append(whole.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)))
+
+    def density(self, vertices: Floats, faces: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+        """Texels per unit of length on each face, [F]."""
+        height, width = self._levels[0].shape[:2]
+        places = np.asarray(self.uv, np.float64) * (width, height)
+        texels = _twice_area(np.pad(places, ((0, 0), (0, 1)))[faces])
+        lengths = _twice_area(np.asarray(vertices, np.float64)[faces])
+        return np.sqrt(texels / np.maximum(lengths, 1e-30)).astype(np.float32)
+
+    def colors(self, uv: Floats, footprint: Floats) -> NDArray[np.float32]:
+        """Colours [N, 3] at places [N, 2]; footprint: [N], texels that are one pixel."""
+        level = np.rint(np.log2(np.maximum(footprint, 1.0))).astype(int)
+        level = np.minimum(level, len(self._levels) - 1)
+        found = np.zeros((len(uv), 3), np.float32)
+        for index, picture in enumerate(self._levels):
+            mine = level == index
+            if mine.any():
+                found[mine] = _between_pixels(picture, uv[mine])
+        return found
+
+
+def _twice_area(corners: Floats) -> Floats:
+    """Of triangles [F, 3, 3]: [F]."""
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area: Floats = np.linalg.norm(across, axis=1)
+    return area
+
+
+def _between_pixels(picture: NDArray[np.float32], uv: Floats) -> Floats:
+    """Bilinear interpolation of [H, W, 3] at places in [0, 1], [N, 2]."""
+    height, width = picture.shape[:2]
+    u = np.clip(uv[:, 0] * width - 0.5, 0.0, width - 1.0)
+    v = np.clip(uv[:, 1] * height - 0.5, 0.0, height - 1.0)
+    i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
+    fu, fv = (u - i)[:, None], (v - j)[:, None]
+    top = picture[j, i] * (1.0 - fu) + picture[j, i + 1] * fu
+    bottom = picture[j + 1, i] * (1.0 - fu) + picture[j + 1, i + 1] * fu
+    between: Floats = top * (1.0 - fv) + bottom * fv
+    return between
+
+
 class MeshCaster:
     """A mesh to be looked at; both sides of its faces show, as viewers draw them.
 
-    vertices: [V, 3]. faces: [F, 3], indices. colors: [V, 3] in [0, 1], or None for mid grey.
-    Raises ValueError for a mesh without faces.
+    vertices: [V, 3]. faces: [F, 3], indices. colors: [V, 3] in [0, 1], or a texture to look them
+    up in, or None for mid grey. Raises ValueError for a mesh without faces.
     """
 
     def __init__(
-        self, vertices: Floats, faces: NDArray[np.integer[Any]], colors: Floats | None
+        self, vertices: Floats, faces: NDArray[np.integer[Any]], colors: Floats | Texture | None
     ) -> None:
         if len(faces) == 0:
             raise ValueError("a mesh without faces shows nothing")
         self._faces = np.ascontiguousarray(faces, np.uint32)
-        grey = np.full((len(vertices), 3), 0.5, np.float32)
-        self._colors = grey if colors is None else np.asarray(colors, np.float32)
+        self._texture = colors if isinstance(colors, Texture) else None
+        if isinstance(colors, Texture):
+            self._values = np.asarray(colors.uv, np.float32)
+            self._density = colors.density(vertices, faces)
+        else:
+            grey = np.full((len(vertices), 3), 0.5, np.float32)
+            self._values = grey if colors is None else np.asarray(colors, np.float32)
         self._scene = _tensor_geometry.RaycastingScene()
         self._scene.add_triangles(
             _core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
@@ -78,19 +139,28 @@ class MeshCaster:
         """What camera `index` sees."""
         width, height = cameras.size[index].tolist()
         rays = cameras.image_rays(index)
-        return self.along(rays.origins.numpy(), rays.directions.numpy(), (height, width))
+        angle = 1.0 / float(cameras.focal[index].mean())
+        return self.along(rays.origins.numpy(), rays.directions.numpy(), (height, width), angle)
 
-    def along(self, origins: Floats, directions: Floats, shape: tuple[int, ...]) -> AssetView:
-        """What rays [N, 3] with unit directions meet, as pictures of `shape`, N in all."""
+    def along(
+        self, origins: Floats, directions: Floats, shape: tuple[int, ...], angle: float = 0.0
+    ) -> AssetView:
+        """What rays [N, 3] with unit directions meet, as pictures of `shape`, N in all.
+
+        angle: between neighbouring rays, radians, which decides how fine a texture is looked at.
+        """
         rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
         found = self._scene.cast_rays(_core.Tensor.from_numpy(np.ascontiguousarray(rays)))
         distance = found["t_hit"].numpy()
         hit = np.isfinite(distance)
-        corners = self._colors[self._faces[found["primitive_ids"].numpy()[hit]]]
+        met = found["primitive_ids"].numpy()[hit]
         u, v = found["primitive_uvs"].numpy()[hit].T
         weights = np.stack([1.0 - u - v, u, v], axis=1)
+        values = np.einsum("nc,ncd->nd", weights, self._values[self._faces[met]])
+        if self._texture is not None:
+            values = self._texture.colors(values, self._density[met] * distance[hit] * angle)
         color = np.zeros((len(rays), 3), np.float32)
-        color[hit] = np.einsum("nc,ncd->nd", weights, corners)
+        color[hit] = values
         return AssetView(
             color=color.reshape(*shape, 3),
             hit=hit.reshape(shape),

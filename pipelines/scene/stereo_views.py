@@ -14,6 +14,7 @@ from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.depth_sampling import sampled
 from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.sensor_depth import load_sensor_depth
 
 _OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
 
@@ -63,8 +64,7 @@ def sensor_depth(
     """
     if image.depth is None:
         return None
-    with np.load(root / image.depth, allow_pickle=False) as held:
-        z = held["z"].astype(np.float32)
+    z = load_sensor_depth(root / image.depth)
     height, width = z.shape
     u, v = _image_pixels(lens, pinhole)
     return sampled(z, u * (width / lens.width) - 0.5, v * (height / lens.height) - 0.5)

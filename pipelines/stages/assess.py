@@ -1,6 +1,6 @@
 """The assess stage: the delivered mesh and cloud, seen from cameras that nothing was made from.
 
-Reads the held-out photos with their masks, the cameras of `train`, `mesh.ply` and `pointcloud.ply`
+Reads the held-out photos with their masks, the cameras of `train`, `mesh.glb` and `pointcloud.ply`
 as they are delivered, and what `evaluate` found of floaters. Where training held nothing out,
 training views take the place of held-out ones, and the result says so. Writes `assets.json` and
 `images/<name>.jpg`: photo | mesh | where there is none. Nothing is rendered from the model, no GPU
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,14 +19,21 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipelines.errors import ExportError
+from pipelines.exports.formats.glb import is_textured, read_textured
 from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.judging.asset_scores import DEFINITIONS, mean_scores, picture_of, score_view
-from pipelines.judging.asset_views import AssetView, MeshCaster, cloud_view, point_spacing
+from pipelines.judging.asset_views import (
+    AssetView,
+    MeshCaster,
+    Texture,
+    cloud_view,
+    point_spacing,
+)
 from pipelines.judging.depth_scores import (
     depth_agreement,
     depth_scores,
     fitted_scale,
-    read_depth_png,
+    nearest,
 )
 from pipelines.judging.geometry_gate import Limits, geometry_warning
 from pipelines.nerf.data.images import ImageData, load_images
@@ -34,14 +42,12 @@ from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.options import AssessOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsFile
+from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.scene.trained_scene import nerf_cameras, nerf_errors_as
 from pipelines.stage import StageContext
 from pipelines.stages.evaluate import picture_name
 from pipelines.workspace import Workspace
 
-MILLIMETRE = 0.001
-DEPTH_UNIT_NOTE = "depth_unit_scale_factor"
-"""Key of the notes in `cameras.json`: world units per value of a depth picture."""
 NO_AGREED_DEPTH = "This job made no depth maps that views agree on."
 _AGREEMENT_VIEWS = 8
 
@@ -78,8 +84,7 @@ def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
     (ctx.out / "images").mkdir(exist_ok=True)
     views = load_views(ctx.workspace, options)
     ctx.progress(0.1, "reading the mesh")
-    mesh = read_ply(ctx.workspace.stage("mesh") / "mesh.ply")
-    caster = _caster(mesh, views.frame)
+    caster = _caster(ctx.workspace.stage("mesh"), views.frame)
     seen = _look_at_mesh(caster, views, options, ctx)
     agreement, no_agreement = _against_agreed_depth(caster, views.frame, ctx.workspace)
     cloud = read_ply(ctx.workspace.stage("pointcloud") / "pointcloud.ply")
@@ -166,7 +171,13 @@ class _Seen:
     rows: list[dict[str, float | None]]
 
 
-def _caster(mesh: Ply, frame: SceneTransform) -> MeshCaster:
+def _caster(folder: Path, frame: SceneTransform) -> MeshCaster:
+    """The mesh as it is delivered: with its texture, where it has one."""
+    if is_textured(folder / "mesh.glb"):
+        skin = read_textured(folder / "mesh.glb")
+        texture = Texture(skin.uv, skin.texture)
+        return MeshCaster(frame.scene_from_world(skin.vertices), skin.faces, texture)
+    mesh = read_ply(folder / "mesh.ply")
     colors = None if mesh.colors is None else mesh.colors.astype(np.float32) / 255.0
     return MeshCaster(frame.scene_from_world(mesh.points), mesh.faces, colors)
 
@@ -247,14 +258,12 @@ def _against_sensor(
     rows = [row for row, image in enumerate(views.posed) if image.depth is not None]
     if not rows:
         return None, "The capture holds no depth."
-    notes = CamerasFile.load(workspace.stage("train") / "cameras.json").notes
-    unit = float(notes.get(DEPTH_UNIT_NOTE, MILLIMETRE))
     found, truth = [], []
     for row in rows:
         shape = (seen[row].hit.shape[0], seen[row].hit.shape[1])
         path = workspace.images_root / str(views.posed[row].depth)
         try:
-            depth = read_depth_png(path, unit, shape)
+            depth = nearest(load_sensor_depth(path), shape)
         except ValueError as error:
             return None, f"The capture's depth was not compared: {error}"
         valid = views.valid(row)

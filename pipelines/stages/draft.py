@@ -17,10 +17,12 @@ from PIL import Image
 
 from pipelines.errors import ExportError
 from pipelines.exports.formats import glb
-from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import reach_of
 from pipelines.exports.surface.shells import find_shells, fuse_shells
-from pipelines.judging.asset_views import MeshCaster
+from pipelines.exports.texture.bake import texture_from_photos
+from pipelines.exports.texture.photos import Photos
+from pipelines.judging.asset_views import MeshCaster, Texture
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.options import DraftOptions
 from pipelines.scene.bounds import bounds_of_views
@@ -31,7 +33,7 @@ from pipelines.scene.stereo_views import undistorted_picture
 from pipelines.stage import StageContext
 
 _PICTURE_LONG_SIDE = 640
-_LOAD_SHARE, _FUSE_SHARE = 0.4, 0.9
+_LOAD_SHARE, _FUSE_SHARE, _TEXTURE_SHARE = 0.3, 0.6, 0.95
 _BACKGROUND = 128
 _NUM_PROBES = 16
 
@@ -65,8 +67,11 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
         )
     if len(mesh.faces) == 0:
         return _nothing(options, ctx, "no two depth maps agree on a surface")
-    glb.write_mesh(ctx.out / "draft.glb", mesh)
-    _save_picture(ctx.out / "draft.jpg", mesh, probes[len(probes) // 2], shells[0].bounds.focus)
+    skin: TriangleMesh | TexturedMesh = mesh
+    if options.texture == "photos":
+        skin = _painted(mesh, maps, cameras, options, ctx)
+    glb.write_mesh(ctx.out / "draft.glb", skin)
+    _save_picture(ctx.out / "draft.jpg", skin, probes[len(probes) // 2], shells[0].bounds.focus)
     return {
         "num_faces": len(mesh.faces),
         "num_views": len(views),
@@ -109,14 +114,38 @@ def _views(
     return store
 
 
-def _save_picture(path: Path, mesh: TriangleMesh, view: DepthView, origin: Floats) -> None:
+def _painted(
+    mesh: TriangleMesh,
+    maps: DepthMapsFile,
+    cameras: CamerasFile,
+    options: DraftOptions,
+    ctx: StageContext,
+) -> TexturedMesh:
+    """The mesh with a picture on it, made of the photos that took part."""
+    named = {image.file: image for image in cameras.images}
+    picked = evenly(len(maps), options.num_views or len(maps))
+    images = [named[maps.images[index].file] for index in picked]
+    lenses = [cameras.cameras[image.camera] for image in images]
+    share = _TEXTURE_SHARE - _FUSE_SHARE
+    return texture_from_photos(
+        mesh,
+        Photos(ctx.workspace.images_root, images, lenses),
+        options.texture_px,
+        lambda done: ctx.progress(_FUSE_SHARE + share * done, "painting", None),
+    )
+
+
+def _save_picture(
+    path: Path, mesh: TriangleMesh | TexturedMesh, view: DepthView, origin: Floats
+) -> None:
     """The mesh from a view's camera, on grey."""
     lens = Pinhole.of(view.lens.intrinsics(), _PICTURE_LONG_SIDE)
     rays = lens.directions().reshape(-1, 3) @ view.world_from_camera[:, :3].T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     eye = np.broadcast_to(view.world_from_camera[:, 3] - origin, rays.shape)
-    seen = MeshCaster(mesh.vertices - origin, mesh.faces, mesh.colors).along(
-        eye, rays, (lens.height, lens.width)
+    skin = Texture(mesh.uv, mesh.texture) if isinstance(mesh, TexturedMesh) else mesh.colors
+    seen = MeshCaster(mesh.vertices - origin, mesh.faces, skin).along(
+        eye, rays, (lens.height, lens.width), 1.0 / lens.fl_x
     )
     colors = np.where(seen.hit[..., None], np.rint(255.0 * seen.color), _BACKGROUND)
     Image.fromarray(colors.astype(np.uint8)).save(path, quality=88)

@@ -1,30 +1,36 @@
-"""A triangle mesh as binary glTF 2.0 (`.glb`), with vertex colours and nothing to fetch.
+"""A triangle mesh as binary glTF 2.0 (`.glb`), with a texture or vertex colours, nothing to fetch.
 
 glTF is right-handed with +Y up, our world has +Z up: positions and normals are written turned,
 (x, y, z) -> (x, z, -y), since some readers ignore node transforms. `COLOR_0` is linear (glTF 2.0,
 section 3.7.2.1), our colours are sRGB: they are converted, into 16-bit so that dark tones keep
-their steps. A NeRF's colours contain the light, hence KHR_materials_unlit.
+their steps. A texture is a JPEG, which is sRGB as base colours are, and lies in the file. A
+capture's colours contain the light, hence KHR_materials_unlit.
 
 Source: Khronos, glTF 2.0 specification; KHR_materials_unlit.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 
 Floats = NDArray[np.float64]
 
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT32, _UINT16 = 5126, 5125, 5123
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
+_JPEG_QUALITY = 92
 _MATERIAL: dict[str, Any] = {
     "name": "captured",
     "doubleSided": True,
@@ -45,36 +51,60 @@ def linear_from_srgb(color: Floats) -> Floats:
     return linear
 
 
-def write_mesh(path: Path, mesh: TriangleMesh, generator: str = "nerfworks") -> None:
+@dataclass(frozen=True)
+class _Accessor:
+    """One array of the file. name: of the attribute, "" for indices."""
+
+    name: str
+    values: NDArray[Any]
+    kind: str
+    component: int
+    normalized: bool = False
+
+    def as_dict(self, view: int) -> dict[str, Any]:
+        """The accessor of the buffer view of the same number."""
+        plain: dict[str, Any] = {
+            "bufferView": view,
+            "componentType": self.component,
+            "count": self.values.size if self.kind == "SCALAR" else len(self.values),
+            "type": self.kind,
+        }
+        if self.normalized:
+            plain["normalized"] = True
+        if self.name == "POSITION":
+            plain["min"] = [float(value) for value in self.values.min(axis=0)]
+            plain["max"] = [float(value) for value in self.values.max(axis=0)]
+        return plain
+
+
+def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, generator: str = "nerfworks") -> None:
     """Write a mesh of our world, +Z up; its normals may have any length.
 
     Raises ValueError for an empty mesh, and where shapes or indices do not fit.
     """
-    vertices, faces, colors, normals = mesh.vertices, mesh.faces, mesh.colors, mesh.normals
+    vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
     if len(vertices) == 0 or len(faces) == 0:
         raise ValueError("glTF cannot hold a mesh without faces")
-    if colors.shape != vertices.shape or normals.shape != vertices.shape:
-        raise ValueError(
-            f"colors {colors.shape} and normals {normals.shape} must be like {vertices.shape}"
-        )
+    if normals.shape != vertices.shape:
+        raise ValueError(f"normals {normals.shape} must be like {vertices.shape}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("a face names a vertex that does not exist")
-    position = _y_up(vertices).astype("<f4")
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     unit = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
-    rgba = np.full((len(vertices), 4), 65535, "<u2")
-    rgba[:, :3] = np.rint(65535.0 * linear_from_srgb(np.clip(colors, 0.0, 1.0)))
-    blobs = [
-        position.tobytes(),
-        _y_up(unit).astype("<f4").tobytes(),
-        rgba.tobytes(),
-        faces.astype("<u4").tobytes(),
+    accessors = [
+        _Accessor("POSITION", _y_up(vertices).astype("<f4"), "VEC3", _FLOAT),
+        _Accessor("NORMAL", _y_up(unit).astype("<f4"), "VEC3", _FLOAT),
+        _colored(mesh),
+        _Accessor("", faces.astype("<u4"), "SCALAR", _UINT32),
     ]
-    document = _document(position, len(faces), [len(blob) for blob in blobs], generator)
+    picture = _jpeg(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
+    # Arrays are multiples of 4 bytes by their types; the picture comes last and is padded.
+    blobs = [accessor.values.tobytes() for accessor in accessors] + [picture] * bool(picture)
+    document = _document(accessors, [len(blob) for blob in blobs], bool(picture), generator)
     text = json.dumps(document, separators=(",", ":")).encode("utf-8")
     text += b" " * (-len(text) % 4)
-    # Every part is a multiple of 4 bytes by its type, so the views need no padding.
     binary = b"".join(blobs)
+    binary += b"\0" * (-len(binary) % 4)
     total = 12 + 8 + len(text) + 8 + len(binary)
     if total >= 2**32:
         raise ValueError(f"{total} bytes do not fit in a .glb: simplify the mesh")
@@ -84,19 +114,96 @@ def write_mesh(path: Path, mesh: TriangleMesh, generator: str = "nerfworks") -> 
         file.write(struct.pack("<II", len(binary), _BIN) + binary)
 
 
+def is_textured(path: Path) -> bool:
+    """Whether a file that `write_mesh` wrote has a texture. Raises ValueError for another file."""
+    return "images" in _parts(path)[0]
+
+
+def read_textured(path: Path) -> TexturedMesh:
+    """Read back what `write_mesh` wrote of a textured mesh, into our world.
+
+    Raises ValueError for a file without a texture, or that is not one of ours.
+    """
+    document, binary = _parts(path)
+    try:
+        views = [
+            binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+            for view in document["bufferViews"]
+        ]
+        (primitive,) = document["meshes"][0]["primitives"]
+        at = primitive["attributes"]
+        picture = views[document["images"][0]["bufferView"]]
+        position, normal = (
+            _z_up(np.frombuffer(views[at[name]], "<f4").reshape(-1, 3).astype(np.float64))
+            for name in ("POSITION", "NORMAL")
+        )
+        uv = np.frombuffer(views[at["TEXCOORD_0"]], "<f4").reshape(-1, 2).astype(np.float64)
+        faces = np.frombuffer(views[primitive["indices"]], "<u4").reshape(-1, 3).astype(np.int32)
+        with Image.open(io.BytesIO(picture)) as opened:
+            texture = np.asarray(opened.convert("RGB"))
+    except (KeyError, IndexError, TypeError, OSError, ValueError) as error:
+        raise ValueError(f"{path.name} is no textured mesh of ours: {error}") from error
+    return TexturedMesh(position, faces, normal, uv, texture)
+
+
+def _parts(path: Path) -> tuple[dict[str, Any], memoryview]:
+    """The JSON and the binary part. Raises ValueError for what is no binary glTF 2.0."""
+    data = path.read_bytes()
+    try:
+        magic, version, _, length, _ = struct.unpack_from("<IIIII", data)
+        if (magic, version) != (_MAGIC, _VERSION):
+            raise ValueError("its first bytes are others")
+        document: dict[str, Any] = json.loads(data[20 : 20 + length])
+    except (struct.error, ValueError) as error:
+        raise ValueError(f"{path.name} is no binary glTF 2.0: {error}") from error
+    return document, memoryview(data)[28 + length :]
+
+
+def _colored(mesh: TriangleMesh | TexturedMesh) -> _Accessor:
+    """What gives a vertex its colour."""
+    count = len(mesh.vertices)
+    if isinstance(mesh, TexturedMesh):
+        if mesh.uv.shape != (count, 2):
+            raise ValueError(f"uv {mesh.uv.shape} must be ({count}, 2)")
+        return _Accessor("TEXCOORD_0", mesh.uv.astype("<f4"), "VEC2", _FLOAT)
+    if mesh.colors.shape != mesh.vertices.shape:
+        raise ValueError(f"colors {mesh.colors.shape} must be like {mesh.vertices.shape}")
+    rgba = np.full((count, 4), 65535, "<u2")
+    rgba[:, :3] = np.rint(65535.0 * linear_from_srgb(np.clip(mesh.colors, 0.0, 1.0)))
+    return _Accessor("COLOR_0", rgba, "VEC4", _UINT16, normalized=True)
+
+
+def _jpeg(texture: NDArray[np.uint8]) -> bytes:
+    """The picture as a JPEG with all of its colour resolution."""
+    held = io.BytesIO()
+    Image.fromarray(texture).save(held, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+    return held.getvalue()
+
+
 def _y_up(vectors: Floats) -> Floats:
     """(x, y, z) with +Z up -> (x, z, -y) with +Y up: a turn by -90 degrees about X."""
     return np.stack((vectors[:, 0], vectors[:, 2], -vectors[:, 1]), axis=1)
 
 
+def _z_up(vectors: Floats) -> Floats:
+    """The inverse of `_y_up`."""
+    return np.stack((vectors[:, 0], -vectors[:, 2], vectors[:, 1]), axis=1)
+
+
 def _document(
-    position: NDArray[np.float32], num_faces: int, sizes: list[int], generator: str
+    accessors: list[_Accessor], sizes: list[int], has_picture: bool, generator: str
 ) -> dict[str, Any]:
-    """The JSON part. sizes: bytes of positions, normals, colours, indices, in this order."""
+    """The JSON part. sizes: bytes of each accessor, then of the picture where there is one."""
     offsets = [sum(sizes[:i]) for i in range(len(sizes))]
-    targets = [_ARRAY_BUFFER] * 3 + [_ELEMENT_ARRAY_BUFFER]
-    num = len(position)
-    return {
+    views: list[dict[str, Any]] = [
+        {"buffer": 0, "byteOffset": offset, "byteLength": size}
+        for offset, size in zip(offsets, sizes, strict=True)
+    ]
+    for view, accessor in zip(views, accessors, strict=False):
+        view["target"] = _ARRAY_BUFFER if accessor.name else _ELEMENT_ARRAY_BUFFER
+    names = [accessor.name for accessor in accessors]
+    material = _MATERIAL
+    document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": generator},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
@@ -106,37 +213,24 @@ def _document(
             {
                 "primitives": [
                     {
-                        "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2},
-                        "indices": 3,
+                        "attributes": {name: i for i, name in enumerate(names) if name},
+                        "indices": names.index(""),
                         "material": 0,
                         "mode": 4,
                     }
                 ]
             }
         ],
-        "materials": [_MATERIAL],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": _FLOAT,
-                "count": num,
-                "type": "VEC3",
-                "min": [float(value) for value in position.min(axis=0)],
-                "max": [float(value) for value in position.max(axis=0)],
-            },
-            {"bufferView": 1, "componentType": _FLOAT, "count": num, "type": "VEC3"},
-            {
-                "bufferView": 2,
-                "componentType": _UINT16,
-                "normalized": True,
-                "count": num,
-                "type": "VEC4",
-            },
-            {"bufferView": 3, "componentType": _UINT32, "count": 3 * num_faces, "type": "SCALAR"},
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": offset, "byteLength": size, "target": target}
-            for offset, size, target in zip(offsets, sizes, targets, strict=True)
-        ],
-        "buffers": [{"byteLength": sum(sizes)}],
+        "accessors": [accessor.as_dict(view) for view, accessor in enumerate(accessors)],
+        "bufferViews": views,
+        "buffers": [{"byteLength": sum(sizes) + -sum(sizes) % 4}],
     }
+    if has_picture:
+        base = {**_MATERIAL["pbrMetallicRoughness"], "baseColorTexture": {"index": 0}}
+        material = {**_MATERIAL, "pbrMetallicRoughness": base}
+        wraps = {"wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}
+        document["images"] = [{"bufferView": len(accessors), "mimeType": "image/jpeg"}]
+        document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR, **wraps}]
+        document["textures"] = [{"sampler": 0, "source": 0}]
+    document["materials"] = [material]
+    return document

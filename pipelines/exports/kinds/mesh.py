@@ -1,6 +1,7 @@
-"""The mesh: rendered depth fused into coloured triangles, as PLY and GLB.
+"""The mesh: rendered depth fused into triangles, as PLY and GLB.
 
-`mesh.ply` is in the world frame of cameras.json, `mesh.glb` has +Y up, as glTF demands.
+`mesh.ply` is in the world frame of cameras.json and has the field's colours on its vertices;
+`mesh.glb` has +Y up, as glTF demands, and a texture from the training photos.
 """
 
 from __future__ import annotations
@@ -13,16 +14,16 @@ from pydantic import Field
 
 from pipelines.errors import ExportError
 from pipelines.exports.export import Export
-from pipelines.exports.options import CropOptions, reach_of
+from pipelines.exports.options import CropOptions, TextureOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
     from pipelines.scene.trained_scene import TrainedScene
 
-_RENDER_SHARE, _FUSE_SHARE = 0.7, 0.97
+_RENDER_SHARE, _FUSE_SHARE, _TEXTURE_SHARE = 0.6, 0.8, 0.97
 
 
-class MeshOptions(CropOptions):
+class MeshOptions(CropOptions, TextureOptions):
     """The mesh, by fusing rendered depth (TSDF)."""
 
     resolution: int = Field(
@@ -49,6 +50,8 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.formats import glb, ply
     from pipelines.exports.surface.shells import find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
+    from pipelines.exports.texture.bake import texture_from_photos
+    from pipelines.exports.texture.photos import Photos
     from pipelines.scene.depth_views import Pinhole
 
     ctx.progress(0.0, "looking for the scene's bounds")
@@ -76,10 +79,24 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         )
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
-    ctx.progress(0.98, "writing")
     ply.write_mesh(ctx.out / "mesh.ply", mesh)
-    glb.write_mesh(ctx.out / "mesh.glb", mesh)
+    summary: dict[str, Any] = {"texture_px": None}
+    if options.texture == "photos":
+        shown = scene.training_images()
+        photos = Photos(ctx.workspace.images_root, shown, [scene.lens_of(image) for image in shown])
+        share = _TEXTURE_SHARE - _FUSE_SHARE
+        textured = texture_from_photos(
+            mesh,
+            photos,
+            options.texture_px,
+            lambda done: ctx.progress(_FUSE_SHARE + share * done, "painting", None),
+        )
+        glb.write_mesh(ctx.out / "mesh.glb", textured)
+        summary = {"texture_px": len(textured.texture)}
+    else:
+        glb.write_mesh(ctx.out / "mesh.glb", mesh)
     return {
+        **summary,
         "num_vertices": len(mesh.vertices),
         "num_faces": len(mesh.faces),
         "num_views": len(images),
@@ -102,8 +119,8 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=3,
-    reads=("depth",),
+    version=4,
+    reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,
     artifacts=(

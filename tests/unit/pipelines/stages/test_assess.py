@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from pipelines.errors import ExportError
+from pipelines.exports.formats import glb
 from pipelines.exports.formats.ply import write_mesh, write_points
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.nerf.stereo.maps import DepthMap
@@ -75,6 +76,7 @@ def _exact_assets(job: Workspace, keep: float = 1.0, floaters: float | None = 0.
     upward = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     mesh = TriangleMesh(points, np.concatenate(faces).astype(np.int32), shades, upward)
     write_mesh(job.stage("mesh") / "mesh.ply", mesh)
+    glb.write_mesh(job.stage("mesh") / "mesh.glb", mesh)
     write_points(job.stage("pointcloud") / "pointcloud.ply", points, painted)
     found = None if floaters is None else {"depth_inconsistency": floaters}
     (job.stage("evaluate") / "metrics.json").write_text(json.dumps({"floaters": found}), "utf-8")

@@ -11,8 +11,13 @@ import numpy as np
 import open3d
 import pytest
 
-from pipelines.exports.formats.glb import linear_from_srgb, write_mesh
-from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.formats.glb import (
+    is_textured,
+    linear_from_srgb,
+    read_textured,
+    write_mesh,
+)
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 
 VERTICES = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -42,7 +47,7 @@ def parse(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
     binary = data[28 + json_bytes :]
     assert len(binary) == bin_bytes == document["buffers"][0]["byteLength"]
     types = {5126: "<f4", 5125: "<u4", 5123: "<u2"}
-    widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+    widths = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
     arrays = []
     for accessor in document["accessors"]:
         view = document["bufferViews"][accessor["bufferView"]]
@@ -102,3 +107,69 @@ def test_a_mesh_that_gltf_cannot_hold_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="must be like"):
         write_mesh(path, TriangleMesh(VERTICES, FACES, COLORS[:3], NORMALS))
     assert not path.exists()
+
+
+@pytest.fixture
+def textured(tmp_path: Path) -> Path:
+    picture = np.zeros((64, 64, 3), np.uint8)
+    picture[:32, :32], picture[:32, 32:] = (200, 30, 30), (30, 200, 30)
+    picture[32:] = (30, 30, 200)
+    uv = np.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]])
+    path = tmp_path / "textured.glb"
+    write_mesh(path, TexturedMesh(VERTICES, FACES, NORMALS, uv, picture))
+    return path
+
+
+def test_a_texture_lies_in_the_file_and_comes_back(textured: Path, file: Path) -> None:
+    assert is_textured(textured)
+    assert not is_textured(file)
+    mesh = read_textured(textured)
+    np.testing.assert_allclose(mesh.vertices, VERTICES, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, FACES)
+    np.testing.assert_allclose(mesh.uv, [[0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]], atol=1e-6)
+    assert mesh.texture.shape == (64, 64, 3)
+    for place, wanted in (
+        ((10, 10), (200, 30, 30)),
+        ((10, 50), (30, 200, 30)),
+        ((50, 30), (30, 30, 200)),
+    ):
+        assert np.abs(mesh.texture[place].astype(int) - wanted).max() < 12
+
+
+def test_a_textured_document_is_as_the_specification_wants_it(textured: Path) -> None:
+    document, (_, _, uv, _) = parse(textured)
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["attributes"] == {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}
+    assert primitive["indices"] == 3
+    np.testing.assert_allclose(uv[:, 1], [0.1, 0.1, 0.9, 0.9], atol=1e-6)
+    material = document["materials"][0]
+    assert material["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
+    assert document["textures"] == [{"sampler": 0, "source": 0}]
+    image = document["images"][0]
+    assert image["mimeType"] == "image/jpeg"
+    view = document["bufferViews"][image["bufferView"]]
+    assert "target" not in view
+    length = int.from_bytes(textured.read_bytes()[12:16], "little")
+    binary = textured.read_bytes()[28 + length :]
+    assert binary[view["byteOffset"] : view["byteOffset"] + 3] == b"\xff\xd8\xff"
+
+
+def test_open3d_reads_a_textured_mesh(textured: Path) -> None:
+    mesh = open3d.io.read_triangle_mesh(str(textured))
+    assert len(mesh.triangles) == 4
+    assert mesh.has_triangle_uvs()
+
+
+def test_files_that_are_no_textured_mesh_are_refused(tmp_path: Path, file: Path) -> None:
+    with pytest.raises(ValueError, match=r"mesh\.glb is no textured mesh"):
+        read_textured(file)
+    broken = tmp_path / "broken.glb"
+    for content in (b"", b"glTF", b"PK" * 20, file.read_bytes()[:60]):
+        broken.write_bytes(content)
+        with pytest.raises(ValueError, match=r"broken\.glb is no"):
+            is_textured(broken)
+    uv = np.zeros((3, 2))
+    with pytest.raises(ValueError, match="uv"):
+        write_mesh(
+            broken, TexturedMesh(VERTICES, FACES, NORMALS, uv, np.zeros((4, 4, 3), np.uint8))
+        )

@@ -9,6 +9,7 @@ import open3d
 import pytest
 
 from pipelines.errors import Cancelled, ExportError
+from pipelines.exports.formats.glb import is_textured, read_textured
 from pipelines.exports.formats.ply import read_ply
 from pipelines.manifest import RunHooks
 from pipelines.workspace import Workspace
@@ -30,6 +31,19 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
     np.testing.assert_allclose(glb[:, 2].max(), -mesh.points[:, 1].min(), atol=1e-4)
     files = {path.name for path in job.stage("mesh").iterdir()}
     assert files == {"mesh.ply", "mesh.glb", "manifest.json"}
+
+
+def test_the_glb_is_painted_with_the_photos_unless_told_not_to(job: Workspace) -> None:
+    summary = tiny_job.run(job, "mesh")["summary"]
+    painted = read_textured(job.stage("mesh") / "mesh.glb")
+    mesh = read_ply(job.stage("mesh") / "mesh.ply")
+    assert len(painted.faces) == len(mesh.faces)
+    assert painted.texture.shape[:2] == (summary["texture_px"],) * 2
+    corners = painted.vertices[painted.faces]
+    assert np.abs(corners - mesh.points[mesh.faces]).max() < 1e-4
+    plain = tiny_job.run(job, "mesh", texture="none")["summary"]
+    assert plain["texture_px"] is None
+    assert not is_textured(job.stage("mesh") / "mesh.glb")
 
 
 def _lie_within(points: np.ndarray, bounds: dict[str, Any]) -> None:

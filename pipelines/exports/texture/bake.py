@@ -1,0 +1,161 @@
+"""A mesh with a picture on it, out of the photos of the capture.
+
+Vertex colours cannot be finer than triangles are; photos are. Each face takes its colours from one
+photo, which keeps them sharp; brightness is levelled across the seams. Faces that no photo shows
+keep their vertices' colours. Memory: one photo at a time and the picture itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import open3d
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+from pipelines.exports.texture.charts import CELL_PX, Charts, Layout, cut, lay_out
+from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos
+from pipelines.exports.texture.levelling import levels
+from pipelines.exports.texture.photos import Photos, colors_at, softened
+
+Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+_CHOICE_SHARE, _CUT_SHARE, _COPY_SHARE = 0.55, 0.65, 0.85
+_ROWS = 256
+_SPREAD_PX = 3
+
+# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
+_core: Any = open3d.core
+_tensor_geometry: Any = open3d.t.geometry
+
+
+def texture_from_photos(
+    mesh: TriangleMesh,
+    photos: Photos,
+    largest_side: int,
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> TexturedMesh:
+    """Paint a mesh of the world. largest_side: of the texture, px, a power of two.
+
+    on_progress: told the share that is done; may raise.
+    """
+    vertices = photos.frame.scene_from_world(mesh.vertices)
+    surface = Surface(vertices, mesh.faces, mesh.normals)
+    choice = choose_photos(surface, photos, lambda done: on_progress(_CHOICE_SHARE * done))
+    charts = cut(mesh.faces, choice, lambda index, which: photos.pixels(index, vertices[which])[0])
+    layout = lay_out(charts, photos.size, largest_side)
+    on_progress(_CUT_SHARE)
+    picture, colors = _copied(
+        charts,
+        layout,
+        photos,
+        lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
+    )
+    added = levels(charts, colors)
+    own = mesh.colors[charts.vertex]
+    _level(picture, charts, layout, added, lambda: on_progress(_COPY_SHARE))
+    _fill_cells(picture, charts, layout, own)
+    on_progress(1.0)
+    return TexturedMesh(
+        vertices=mesh.vertices[charts.vertex],
+        faces=charts.faces,
+        normals=mesh.normals[charts.vertex],
+        uv=layout.uv / layout.side,
+        texture=picture,
+    )
+
+
+def _copied(
+    charts: Charts, layout: Layout, photos: Photos, on_progress: Callable[[float], None]
+) -> tuple[Bytes, Floats]:
+    """The patches in their places, and each corner's colour in its photo, [U, 3]."""
+    picture = np.zeros((layout.side, layout.side, 3), np.uint8)
+    colors = np.full((len(charts.vertex), 3), np.nan)
+    by_photo = charts.photo[layout.charts]
+    used = np.unique(by_photo)
+    for done, index in enumerate(used, start=1):
+        photo = photos.load(int(index))
+        whole = np.asarray(photo)
+        for row in np.flatnonzero(by_photo == index):
+            left, top, right, bottom = layout.source[row].tolist()
+            x, y, x_end, y_end = layout.target[row].tolist()
+            size = (x_end - x, y_end - y)
+            if size == (right - left, bottom - top):
+                patch = whole[top:bottom, left:right]
+            else:
+                patch = np.asarray(
+                    photo.resize(size, Image.Resampling.BOX, (left, top, right, bottom))
+                )
+            picture[y:y_end, x:x_end] = patch
+        mine = charts.photo[charts.chart] == index
+        colors[mine] = colors_at(softened(photo), charts.place[mine])
+        on_progress(done / len(used))
+    return picture, colors
+
+
+def _level(
+    picture: Bytes, charts: Charts, layout: Layout, added: Floats, on_rows: Callable[[], None]
+) -> None:
+    """Add what each corner needs, and between corners what lies between, in place."""
+    shown = charts.photo[charts.face_chart] != NOBODY
+    if not shown.any():
+        return
+    faces = np.ascontiguousarray(charts.faces[shown], np.uint32)
+    flat = np.concatenate([layout.uv, np.zeros((len(layout.uv), 1))], axis=1)
+    scene = _tensor_geometry.RaycastingScene()
+    scene.add_triangles(_core.Tensor(flat.astype(np.float32)), _core.Tensor(faces))
+    steps = np.zeros(picture.shape, np.int16)
+    covered = np.zeros(picture.shape[:2], np.bool_)
+    columns = np.arange(layout.side) + 0.5
+    last = int(np.ceil(layout.uv[:, 1].max())) + 1
+    for top in range(0, min(last, layout.side), _ROWS):
+        rows = np.arange(top, min(top + _ROWS, layout.side)) + 0.5
+        rays = np.zeros((len(rows), layout.side, 6), np.float32)
+        rays[..., 0], rays[..., 1] = columns[None, :], rows[:, None]
+        rays[..., 2], rays[..., 5] = 1.0, -1.0
+        found = scene.cast_rays(_core.Tensor(rays))
+        hit = np.isfinite(found["t_hit"].numpy())
+        corners = added[faces[found["primitive_ids"].numpy()[hit]]]
+        u, v = found["primitive_uvs"].numpy()[hit].T
+        weights = np.stack([1.0 - u - v, u, v], axis=1)
+        part = slice(top, top + len(rows))
+        values = np.rint(255.0 * np.einsum("nc,ncd->nd", weights, corners))
+        steps[part][hit] = np.clip(values, -255, 255).astype(np.int16)
+        covered[part] = hit
+        on_rows()
+    _spread(steps, covered)
+    np.clip(picture + steps, 0, 255, out=steps)
+    picture[:] = steps.astype(np.uint8)
+
+
+def _spread(values: NDArray[np.int16], covered: NDArray[np.bool_]) -> None:
+    """Carry values a few pixels beyond what is covered, in place."""
+    for _ in range(_SPREAD_PX):
+        for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            into, out = [slice(None)] * 2, [slice(None)] * 2
+            into[axis], out[axis] = (
+                (slice(1, None), slice(None, -1)) if step > 0 else (slice(None, -1), slice(1, None))
+            )
+            take = ~covered[tuple(into)] & covered[tuple(out)]
+            values[tuple(into)][take] = values[tuple(out)][take]
+            covered[tuple(into)] |= take
+
+
+def _fill_cells(picture: Bytes, charts: Charts, layout: Layout, colors: Floats) -> None:
+    """Gradients between the corners' own colours [U, 3], for faces that no photo shows."""
+    alone = np.flatnonzero(charts.photo[charts.face_chart] == NOBODY)
+    if len(alone) == 0:
+        return
+    corners = charts.faces[alone]
+    start = np.floor(layout.uv[corners[:, 0]]).astype(int)
+    first, right, below = (colors[corners[:, k]] for k in range(3))
+    reach = CELL_PX - 1
+    for dy in range(CELL_PX):
+        for dx in range(CELL_PX):
+            value = first + (right - first) * (dx / reach) + (below - first) * (dy / reach)
+            texels = np.rint(255.0 * np.clip(value, 0.0, 1.0)).astype(np.uint8)
+            picture[start[:, 1] + dy, start[:, 0] + dx] = texels

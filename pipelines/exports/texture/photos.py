@@ -1,0 +1,114 @@
+"""The photos of a capture as a source of colour: where a point of a surface appears in which.
+
+Points and vertices are in the frame of the photos' cameras: the world less an origin. Pixels are
+those of the stored photo, lens distortion and all; the centre of the top-left one is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageFilter
+
+from pipelines.nerf.space.cameras import SceneTransform
+from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.scene.trained_scene import nerf_cameras
+
+Floats = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+
+_MAX_ANGLE_ERROR = 0.005
+_SMALL_SIDE = 320
+_BLUR_PX = 1.5
+_USABLE = 128
+
+
+class Photos:
+    """N posed photos. origin: of the frame in which points are given, world."""
+
+    def __init__(
+        self, root: Path, images: Sequence[PosedImage], lenses: Sequence[Intrinsics]
+    ) -> None:
+        poses = np.asarray([image.world_from_camera for image in images], np.float64)
+        self._root = root
+        self._images = list(images)
+        self.frame = SceneTransform.fit(poses[:, :, 3], scale_poses=False)
+        self._cameras = nerf_cameras(lenses, poses, self.frame)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def size(self, index: int) -> tuple[int, int]:
+        """Width and height in pixels."""
+        width, height = self._cameras.size[index].tolist()
+        return int(width), int(height)
+
+    def eye(self, index: int) -> Floats:
+        """[3], where the camera is."""
+        eye: Floats = self._cameras.scene_from_camera[index, :, 3].numpy().astype(np.float64)
+        return eye
+
+    def pixels(self, index: int, points: Floats) -> tuple[NDArray[np.float64], Bools]:
+        """Where points [P, 3] appear: pixels [P, 2], and whether that is within the photo [P]."""
+        places = torch.as_tensor(np.ascontiguousarray(points, np.float32))
+        rows = torch.full((len(places),), index, dtype=torch.int64)
+        pixels, _ = self._cameras.project(places, rows)
+        inside = ((pixels >= 1.0) & (pixels <= self._cameras.size[index] - 1.0)).all(dim=-1)
+        which = torch.nonzero(inside).squeeze(-1)
+        # A point behind the camera, or beyond where the lens formula folds back, has a pixel too:
+        # one whose ray leads elsewhere.
+        ways = self._cameras.generate_rays(rows[which], pixels[which]).directions
+        toward = places[which] - self._cameras.scene_from_camera[index, :, 3]
+        toward = torch.nn.functional.normalize(toward, dim=-1)
+        true = (ways - toward).norm(dim=-1) < _MAX_ANGLE_ERROR
+        shown = np.zeros(len(points), np.bool_)
+        shown[which[true].numpy()] = True
+        return pixels.numpy().astype(np.float64), shown
+
+    def load(self, index: int) -> Image.Image:
+        """The photo, RGB."""
+        with Image.open(self._root / self._images[index].file) as opened:
+            return opened.convert("RGB")
+
+    def usable(self, index: int, pixels: Floats) -> Bools:
+        """Whether the photo's mask lets pixels [P, 2] count; all of them without a mask."""
+        mask = self._images[index].mask
+        if mask is None:
+            return np.ones(len(pixels), np.bool_)
+        with Image.open(self._root / mask) as opened:
+            shown = np.asarray(opened.convert("L")) >= _USABLE
+        columns, rows = np.clip(pixels, 0, np.array(shown.shape[::-1]) - 1).astype(int).T
+        kept: Bools = shown[rows, columns]
+        return kept
+
+
+def softened(photo: Image.Image) -> Image.Image:
+    """The photo without what a pose that is a pixel off would change."""
+    return photo.filter(ImageFilter.GaussianBlur(_BLUR_PX))
+
+
+def colors_at(photo: Image.Image, pixels: Floats) -> NDArray[np.float32]:
+    """Colours [P, 3] in [0, 1] at pixels [P, 2], between pixels by bilinear interpolation."""
+    picture = np.asarray(photo, np.float32) / np.float32(255.0)
+    height, width = picture.shape[:2]
+    u = np.clip(pixels[:, 0] - 0.5, 0.0, width - 1.0)
+    v = np.clip(pixels[:, 1] - 0.5, 0.0, height - 1.0)
+    i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
+    fu, fv = (u - i)[:, None], (v - j)[:, None]
+    top = picture[j, i] * (1.0 - fu) + picture[j, i + 1] * fu
+    bottom = picture[j + 1, i] * (1.0 - fu) + picture[j + 1, i + 1] * fu
+    found: NDArray[np.float32] = (top * (1.0 - fv) + bottom * fv).astype(np.float32)
+    return found
+
+
+def sharpness(photo: Image.Image) -> float:
+    """How much fine structure a photo has: the mean step between neighbours, at a small size."""
+    small = photo.convert("L")
+    small.thumbnail((_SMALL_SIDE, _SMALL_SIDE), Image.Resampling.BILINEAR)
+    grey = np.asarray(small, np.float32)
+    return float(np.abs(np.diff(grey, axis=0)).mean() + np.abs(np.diff(grey, axis=1)).mean())

@@ -1,0 +1,145 @@
+"""A texture out of photos, against colours that are known exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.errors import Cancelled
+from pipelines.exports.mesh import TexturedMesh
+from pipelines.exports.texture.bake import texture_from_photos
+from pipelines.judging.asset_views import MeshCaster, Texture
+from tests.unit.pipelines.exports.texture import painted_ball
+from tests.unit.pipelines.exports.texture.painted_ball import CENTER, stripes
+
+
+def surface_samples(mesh: TexturedMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points inside every face, what the texture has there, and the faces' numbers."""
+    weights = np.random.default_rng(0).dirichlet(np.ones(3), size=(len(mesh.faces), 4))
+    points = np.einsum("fkc,fcd->fkd", weights, mesh.vertices[mesh.faces]).reshape(-1, 3)
+    uv = np.einsum("fkc,fcd->fkd", weights, mesh.uv[mesh.faces]).reshape(-1, 2)
+    found = Texture(mesh.uv, mesh.texture).colors(uv, np.ones(len(uv)))
+    return points, found, np.repeat(np.arange(len(mesh.faces)), 4)
+
+
+def on_ball(points: np.ndarray) -> np.ndarray:
+    away = points - CENTER
+    return CENTER + away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
+def test_stripes_finer_than_triangles_are_there_and_in_place(tmp_path: Path) -> None:
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    )
+    mesh = painted_ball.ball()
+    textured = texture_from_photos(mesh, photos, 1024)
+    points, found, _ = surface_samples(textured)
+    error = np.abs(found - stripes(on_ball(points)))
+    assert error.mean() < 0.03
+    assert np.percentile(error, 95) < 0.12
+    assert len(textured.faces) == len(mesh.faces)
+    assert np.allclose(textured.vertices[textured.faces], mesh.vertices[mesh.faces])
+    assert (textured.uv >= 0).all()
+    assert (textured.uv <= 1).all()
+
+
+def test_a_lens_that_bends_is_heeded(tmp_path: Path) -> None:
+    """The same photos said to be of a bending lens: the stripes end up elsewhere."""
+    images = painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    bent = dataclasses.replace(painted_ball.LENS, model="OPENCV", k1=-0.3)
+    errors = []
+    for lens in (painted_ball.LENS, bent):
+        photos = painted_ball.photos_of(tmp_path, images, lens)
+        points, found, _ = surface_samples(texture_from_photos(painted_ball.ball(), photos, 1024))
+        errors.append(np.abs(found - stripes(on_ball(points))).mean())
+    assert errors[1] > 2.0 * errors[0]
+
+
+def test_photos_of_other_exposure_make_no_seams(tmp_path: Path) -> None:
+    gains = np.random.default_rng(0).uniform(0.8, 1.1, 12).tolist()
+    poses = painted_ball.all_round()
+    images = painted_ball.write_photos(tmp_path, poses, gains)
+    textured = texture_from_photos(
+        painted_ball.ball(), painted_ball.photos_of(tmp_path, images), 1024
+    )
+    texture = Texture(textured.uv, textured.texture)
+    at_corners = texture.colors(textured.uv, np.ones(len(textured.uv)))
+    _, vertex = np.unique(np.round(textured.vertices, 6), axis=0, return_inverse=True)
+    order = np.argsort(vertex, kind="stable")
+    same = vertex[order][1:] == vertex[order][:-1]
+    assert same.sum() > 50, "there is no seam to look at"
+    steps = np.abs(at_corners[order[1:]] - at_corners[order[:-1]])[same]
+    assert np.median(steps) < 0.015
+    points, found, _ = surface_samples(textured)
+    truth = stripes(on_ball(points)) * np.mean(gains)
+    assert np.abs(found - truth).mean() < 0.06
+
+
+def test_what_no_photo_shows_keeps_its_vertices_colours(tmp_path: Path) -> None:
+    above = [pose for pose in painted_ball.all_round(24) if pose[2, 3] > CENTER[2] + 1.0]
+    photos = painted_ball.photos_of(tmp_path, painted_ball.write_photos(tmp_path, above))
+    textured = texture_from_photos(painted_ball.ball(), photos, 1024)
+    points, found, _ = surface_samples(textured)
+    below = points[:, 2] < CENTER[2] - 0.8
+    assert below.sum() > 100
+    assert np.abs(found[below] - 0.5).max() < 0.01, "grey, as the vertices are"
+    on_top = points[:, 2] > CENTER[2] + 0.6
+    assert np.abs(found - stripes(on_ball(points)))[on_top].mean() < 0.05
+
+
+def test_a_masked_part_of_the_photos_colours_nothing(tmp_path: Path) -> None:
+    mask = np.full((painted_ball.SIDE, painted_ball.SIDE), 255, np.uint8)
+    mask[:, : painted_ball.SIDE // 2] = 0
+    poses = [painted_ball.all_round()[1]]
+    photos = painted_ball.photos_of(tmp_path, painted_ball.write_photos(tmp_path, poses, mask=mask))
+    textured = texture_from_photos(painted_ball.ball(), photos, 1024)
+    points, found, _ = surface_samples(textured)
+    pixels, shown = photos.pixels(0, photos.frame.scene_from_world(points))
+    hidden = shown & (pixels[:, 0] < painted_ball.SIDE / 2 - 12)
+    assert hidden.sum() > 100
+    assert np.abs(found[hidden] - 0.5).max() < 0.01
+
+
+def test_a_picture_too_small_is_filled_with_less_detail(tmp_path: Path) -> None:
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    )
+    small = texture_from_photos(painted_ball.ball(), photos, 256)
+    assert small.texture.shape == (256, 256, 3)
+    points, found, _ = surface_samples(small)
+    assert np.abs(found - stripes(on_ball(points))).mean() < 0.12
+
+
+def test_a_cancel_is_heeded_between_photos(tmp_path: Path) -> None:
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    )
+    told: list[float] = []
+
+    def on_progress(done: float) -> None:
+        told.append(done)
+        if len(told) == 3:
+            raise Cancelled("stopped")
+
+    with pytest.raises(Cancelled):
+        texture_from_photos(painted_ball.ball(), photos, 1024, on_progress)
+    assert told == sorted(told)
+
+
+def test_from_afar_a_texture_is_looked_up_in_a_smaller_copy() -> None:
+    """A checkerboard of single texels is grey from afar, not one of its two colours."""
+    board = (np.indices((64, 64)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    picture = np.repeat(board[..., None], 3, axis=2)
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    caster = MeshCaster(vertices, faces, Texture(vertices[:, :2], picture))
+    spots = np.random.default_rng(0).uniform(0.2, 0.8, (200, 2))
+    eyes = np.column_stack([spots, np.ones(200)])
+    ways = np.broadcast_to([0.0, 0.0, -1.0], eyes.shape)
+    near = caster.along(eyes, ways, (10, 20), angle=0.0).color
+    far = caster.along(eyes, ways, (10, 20), angle=4.0 / 64).color
+    assert near.std() > 0.15
+    assert np.abs(far - 0.5).max() < 0.01
