@@ -30,7 +30,7 @@ SMALL: dict[str, Any] = {
 
 
 def sample_clip(folder: Path) -> tuple[Path, Path]:
-    """Film the analytic scene. Returns the clip and its true cameras (cameras.json)."""
+    """Film the analytic scene, small. Returns the clip and its true cameras (cameras.json)."""
     clip, truth = folder / "sample.mp4", folder / "truth.json"
-    film_capture(clip).save(truth)
+    film_capture(clip, long_side_px=960).save(truth)
     return clip, truth

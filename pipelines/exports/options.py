@@ -63,10 +63,10 @@ class TextureOptions(StageOptions):
 class CropOptions(RenderingOptions, ExtentOptions):
     """Common to mesh and point cloud."""
 
-    use_depth_maps: bool = Field(
-        False,
+    use_depth_maps: Literal["auto", "on", "off"] = Field(
+        "auto",
         description="Let the depth maps of the stage depth vote on surfaces beside the trained "
-        "field.",
+        "field. auto does so where a sensor measured some of them.",
     )
 
 

@@ -46,20 +46,27 @@ class DepthMapsWriter:
         np.savez_compressed(path, z=relative, unit=np.float64(unit), votes=found.votes)
         self._images.append(MappedImage(file, lens))
 
-    def close(self) -> None:
-        """Write the index."""
+    def close(self, *, measured: bool = False) -> None:
+        """Write the index. measured: whether a sensor had a part in the maps."""
         rows = [{"file": item.file, "lens": asdict(item.lens)} for item in self._images]
-        (self._folder / INDEX).write_text(json.dumps({"images": rows}, indent=1), "utf-8")
+        index = {"measured": measured, "images": rows}
+        (self._folder / INDEX).write_text(json.dumps(index, indent=1), "utf-8")
 
 
 class DepthMapsFile:
-    """The maps that a folder holds, read one at a time. Raises ValueError for a broken index."""
+    """The maps that a folder holds, read one at a time. Raises ValueError for a broken index.
+
+    measured: whether a sensor had a part in them.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         try:
-            rows = json.loads((folder / INDEX).read_text("utf-8"))["images"]
-            self.images = [MappedImage(row["file"], Pinhole(**row["lens"])) for row in rows]
+            index = json.loads((folder / INDEX).read_text("utf-8"))
+            self.measured = bool(index["measured"])
+            self.images = [
+                MappedImage(row["file"], Pinhole(**row["lens"])) for row in index["images"]
+            ]
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{folder / INDEX} is no list of depth maps: {error}") from error
 

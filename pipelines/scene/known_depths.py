@@ -26,6 +26,11 @@ class KnownDepths:
         self._maps = DepthMapsFile(folder)
         self._index = {image.file: index for index, image in enumerate(self._maps.images)}
 
+    @property
+    def measured(self) -> bool:
+        """Whether a sensor had a part in the maps."""
+        return self._maps.measured
+
     def view_of(self, file: str, view: DepthView) -> DepthView | None:
         """What the map of an image says, as another view of it has its pixels; None without one."""
         index = self._index.get(file)

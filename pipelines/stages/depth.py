@@ -87,7 +87,7 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     for image, view, found in zip(images, views, maps, strict=True):
         ctx.check_cancelled()
         writer.append(image.file, _pinhole(view), found)
-    writer.close()
+    writer.close(measured=with_sensor)
     _save_picture(ctx.out / "depth.jpg", views, maps)
     summary |= _described(maps)
     (ctx.out / "report.json").write_text(json.dumps(summary, indent=1), "utf-8")
@@ -125,7 +125,7 @@ def _with_sensor(
     }
     measured = sensor_maps(views, sensed, config)
     both = zip(stereo, measured, strict=True)
-    return [merged(a, b, config.agree_within) for a, b in both], told
+    return [merged(a, b) for a, b in both], told
 
 
 def training_images(ctx: StageContext, split: SplitConfig) -> tuple[CamerasFile, list[PosedImage]]:

@@ -66,8 +66,9 @@ def render_views(
     return store
 
 
-def known_depths(workspace: Workspace, wanted: bool) -> KnownDepths | None:
-    """The maps of the stage `depth`, where it ran and they are wanted."""
-    if not wanted or not workspace.is_complete("depth"):
+def known_depths(workspace: Workspace, wanted: str) -> KnownDepths | None:
+    """The maps of the stage `depth`, where it ran and they are wanted: "auto", "on" or "off"."""
+    if wanted == "off" or not workspace.is_complete("depth"):
         return None
-    return KnownDepths(workspace.stage("depth"))
+    known = KnownDepths(workspace.stage("depth"))
+    return known if wanted == "on" or known.measured else None

