@@ -74,6 +74,7 @@ class PosedPictures:
 
     sources: in the order of the capture. failures: why frames beside those cannot be used, one
     error for each; few are passed over, many fail the capture.
+    up_assumed: whether +Z is up only because files of this format mostly have it so.
     metric: whether the world's unit is the metre. is_dense: whether neighbours are so alike that a
     long capture may be thinned. notes: about the world, for `cameras.json`. details, warnings: for
     the record.
@@ -83,6 +84,7 @@ class PosedPictures:
     metric: bool
     failures: Sequence[CaptureError] = ()
     is_dense: bool = False
+    up_assumed: bool = False
     notes: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
     warnings: Sequence[str] = ()

@@ -22,10 +22,15 @@ from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.options import IngestOptions
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
+from pipelines.scene.orientation import find_up, rotation_to_z
 from pipelines.stage import StageContext
 
 Matrix = npt.NDArray[np.float64]
 
+_CLEARLY = 0.8
+"""Cosine up to which an axis of the world is the vertical, and nothing else is."""
+_SIDEWAYS = 0.7
+"""Mean height of the cameras' X axes above which pictures may be upright ones stored sideways."""
 _SLACK = 0.05
 """How far a rotation may be from orthonormal before it is called malformed; files are rounded."""
 
@@ -84,23 +89,31 @@ def write_posed(
         [name for item in sources for name in item.depth_files], "their pictures are left out"
     )
     cameras: dict[Intrinsics, int] = {}
+    poses = np.array([item.world_from_camera for item in stored], np.float64)
+    notes = dict(capture.notes)
+    turned = other_axis_up(poses) if capture.up_assumed else None
+    if turned is not None:
+        axis, rotation = turned
+        poses = rotation @ poses
+        notes |= {"up": axis, "turned_by": rotation.tolist()}
+        warnings.append(f"In the pictures {axis} of the file's world is up, not +Z: it was turned.")
     images = tuple(
         PosedImage(
             file=item.picture.file,
             camera=cameras.setdefault(item.lens, len(cameras)),
-            world_from_camera=item.world_from_camera,
+            world_from_camera=_rows(pose),
             timestamp_s=item.timestamp_s,
             mask=item.mask,
             depth=item.depth,
         )
-        for item in stored
+        for item, pose in zip(stored, poses, strict=True)
     )
     CamerasFile(
         cameras=tuple(cameras),
         images=images,
         metric=capture.metric,
         source=source,
-        notes=dict(capture.notes),
+        notes=notes,
     ).save(ctx.out / "cameras.json")
     return Found(
         images=[item.picture.as_dict() for item in stored],
@@ -134,11 +147,31 @@ def _store(depths: DepthWriter, writer: PictureWriter, source: PosedSource, numb
     return _Stored(
         picture=picture,
         lens=lens,
-        world_from_camera=tuple(tuple(float(value) for value in row) for row in pose),
+        world_from_camera=_rows(pose),
         timestamp_s=source.timestamp_s,
         mask=mask,
         depth=depth,
     )
+
+
+def _rows(pose: Matrix) -> Rows:
+    return tuple(tuple(float(value) for value in row) for row in pose)
+
+
+def other_axis_up(poses: Matrix) -> tuple[str, Matrix] | None:
+    """The axis of a world that is up in its pictures, and the quarter turn that makes it +Z.
+
+    poses: [N, 3, 4], OpenGL cameras. None where that is +Z, and where it is not clear: pictures
+    stored on their side have level X axes in a world that lies.
+    """
+    up, found_by = find_up(poses)
+    axis = int(np.abs(up).argmax())
+    sideways = float(np.abs(poses[:, 2, 0]).mean()) > _SIDEWAYS
+    if found_by != "vertical" or sideways or abs(up[axis]) < _CLEARLY or up[2] >= _CLEARLY:
+        return None
+    direction = np.zeros(3)
+    direction[axis] = np.sign(up[axis])
+    return f"{'+' if direction[axis] > 0 else '-'}{'XYZ'[axis]}", rotation_to_z(direction)
 
 
 def checked_pose(matrix: Matrix, what: str) -> Matrix:

@@ -2,9 +2,10 @@
 
 Keys: `pipelines.captures.transforms_json`; at the top also applied_transform, applied_scale.
 
-The file's world is kept as it is and taken as +Z up: that is nerfstudio's own convention, and what
-`applied_transform` has led to; both it and `applied_scale` are written down in the notes. Nothing
-says that its unit is the metre, also where there is depth.
+The file's world is kept as it is and taken as +Z up, unless the pictures clearly say that another
+of its axes is: +Z is nerfstudio's own convention, and what `applied_transform` has led to; both it
+and `applied_scale` are written down in the notes, as is a turn. Nothing says that its unit is the
+metre, also where there is depth.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         sources=listed.sources,
         failures=listed.failures,
         metric=False,
+        up_assumed=True,
         notes=_notes(top),
         details={
             "num_listed": len(frames),

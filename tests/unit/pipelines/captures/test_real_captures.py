@@ -132,7 +132,12 @@ def test_office_keeps_the_depth_of_its_sensor(tmp_path: Path) -> None:
     source = zip_of(tmp_path / "office.zip", folder, [p for p in folder.rglob("*") if p.is_file()])
     workspace, summary = prepared(tmp_path, source)
     assert (summary["kind"], summary["num_images"], summary["num_depths"]) == ("nerfstudio", 94, 94)
-    images = CamerasFile.load(workspace.posed_cameras).images
+    file = CamerasFile.load(workspace.posed_cameras)
+    images = file.images
+    assert file.notes["up"] == "+Y"
+    assert any("+Y of the file's world is up" in warning for warning in summary["warnings"])
+    ups = np.array([[row[1] for row in image.world_from_camera] for image in images])
+    assert ups[:, 2].mean() > 0.85
     depths = [load_sensor_depth(workspace.images_root / str(image.depth)) for image in images]
     for z, path in zip(depths, sorted((folder / "depth").iterdir()), strict=True):
         with PIL.Image.open(path) as counts:
