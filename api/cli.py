@@ -222,7 +222,7 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("up", help="Keep the service running from this folder", add_help=False)
     one = command("submit", submit)
     one.add_argument("file", metavar="FILE", help="a video, or a .zip of photos or an app export")
-    one.add_argument("--preset", help="draft, preview, standard or high; else the service chooses")
+    one.add_argument("--preset", help="`nerfworks presets` lists them; else the service chooses")
     one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
     one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
     one.add_argument("--wait", action="store_true", help="show the job until it is over")

@@ -309,6 +309,35 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                     "video": {"num_frames": 96, "long_side_px": 480},
                 },
             ),
+            Preset(
+                "detailed",
+                "Half an hour on a laptop: more pictures, more steps, finer surfaces.",
+                {
+                    "frames": {"num_frames": 120, "long_side_px": 1280},
+                    "poses": {"max_image_px": 1280, "num_features": 6144},
+                    "depth": {"long_side_px": 480, "num_planes": 160},
+                    "train": {
+                        "max_steps": 6000,
+                        "rays_per_step": 2048,
+                        "model": {
+                            "num_proposal_samples": (96, 48),
+                            "num_nerf_samples": 32,
+                            "anneal_steps": 800,
+                            "appearance_dim": 0,
+                            "camera_mode": "off",
+                        },
+                        "data": {"long_side_px": 800},
+                        "optimizer": {"lr": 0.01, "decay_steps": 6000, "lr_final": 3e-4},
+                    },
+                    "pointcloud": {"num_points": 500_000},
+                    "mesh": {
+                        "resolution": 384,
+                        "render_long_side_px": 480,
+                        "max_faces": 400_000,
+                    },
+                    "video": {"num_frames": 144, "long_side_px": 720},
+                },
+            ),
             Preset("standard", "The paper's Nerfacto: 30,000 steps, for a GPU.", {}),
             Preset(
                 "high",
