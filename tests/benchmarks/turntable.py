@@ -13,6 +13,8 @@ import numpy as np
 import open3d
 from numpy.typing import NDArray
 
+from pipelines.judging.asset_views import Texture
+
 Floats = NDArray[np.floating[Any]]
 
 SIDE_PX = 320
@@ -29,16 +31,16 @@ _tensor_geometry: Any = open3d.t.geometry
 def turntable(
     vertices: Floats,
     faces: NDArray[np.integer[Any]],
-    colors: Floats | None,
+    colors: Floats | Texture | None,
     num_views: int = NUM_VIEWS,
     side_px: int = SIDE_PX,
     ball: tuple[Floats, float] | None = None,
 ) -> NDArray[np.uint8]:
     """[2 side, num_views side, 3] uint8: coloured above, shaded below, all round.
 
-    vertices: [V, 3] world. faces: [F, 3]. colors: [V, 3] in [0, 1] or None. ball: middle [3] and
-    radius of what is shown, the rest is left out; without it the middle 98 % of the vertices fill
-    the picture.
+    vertices: [V, 3] world. faces: [F, 3]. colors: [V, 3] in [0, 1], a texture, or None. ball: middle
+    [3] and radius of what is shown, the rest is left out; without it the middle 98 % of the
+    vertices fill the picture.
     """
     if ball is not None:
         outside = np.linalg.norm(vertices - ball[0], axis=1) > ball[1]
@@ -55,12 +57,11 @@ def turntable(
         _core.Tensor.from_numpy(local),
         _core.Tensor.from_numpy(np.ascontiguousarray(faces, np.uint32)),
     )
-    grey = np.full((len(vertices), 3), 0.7)
-    paint = grey if colors is None else np.asarray(colors)
+    paint = _Paint(local, np.asarray(faces), colors, side_px)
     columns = []
     for step in range(num_views):
         eye, directions = _rays(2 * math.pi * step / num_views, side_px)
-        colored, shaded = _look(scene, eye, directions, np.asarray(faces), paint)
+        colored, shaded = _look(scene, eye, directions, paint)
         columns.append(np.concatenate([colored, shaded]).reshape(2 * side_px, side_px, 3))
     strip = np.concatenate(columns, axis=1)
     picture: NDArray[np.uint8] = np.rint(255 * np.clip(strip, 0, 1)).astype(np.uint8)
@@ -86,9 +87,37 @@ def _rays(azimuth: float, side_px: int) -> tuple[Floats, Floats]:
     return eye, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _look(
-    scene: Any, eye: Floats, directions: Floats, faces: NDArray[np.integer[Any]], paint: Floats
-) -> tuple[Floats, Floats]:
+class _Paint:
+    """What colours a mesh: its vertices, or a texture."""
+
+    def __init__(
+        self,
+        vertices: Floats,
+        faces: NDArray[np.integer[Any]],
+        colors: Floats | Texture | None,
+        side_px: int,
+    ) -> None:
+        self._faces = faces
+        self._texture = colors if isinstance(colors, Texture) else None
+        if isinstance(colors, Texture):
+            self._values = np.asarray(colors.uv)
+            self._density = colors.density(vertices, faces)
+            self._angle = math.radians(_FOV_DEG) / side_px
+        else:
+            grey = np.full((len(vertices), 3), 0.7)
+            self._values = grey if colors is None else np.asarray(colors)
+
+    def at(self, met: NDArray[np.integer[Any]], uv: Floats, distance: Floats) -> Floats:
+        """Colours [N, 3] in places of faces."""
+        u, v = uv.T
+        weights = np.stack([1 - u - v, u, v], axis=1)
+        values: Floats = np.einsum("nc,ncd->nd", weights, self._values[self._faces[met]])
+        if self._texture is None:
+            return values
+        return self._texture.colors(values, self._density[met] * distance * self._angle)
+
+
+def _look(scene: Any, eye: Floats, directions: Floats, paint: _Paint) -> tuple[Floats, Floats]:
     """Colours and shades [N, 3] of the first faces that look at the eye."""
     colored = np.full((len(directions), 3), _BACKGROUND)
     shaded = colored.copy()
@@ -104,10 +133,11 @@ def _look(
         facing = -(normals * ways).sum(axis=1)
         front = met & (facing > 0)
         rows, lit = open_rays[front], facing[front]
-        corners = paint[faces[found["primitive_ids"].numpy()[front]]]
-        u, v = found["primitive_uvs"].numpy()[front].T
-        weights = np.stack([1 - u - v, u, v], axis=1)
-        colored[rows] = np.einsum("nc,ncd->nd", weights, corners)
+        colored[rows] = paint.at(
+            found["primitive_ids"].numpy()[front],
+            found["primitive_uvs"].numpy()[front],
+            start[rows] + t[front],
+        )
         shaded[rows] = (0.15 + 0.8 * lit**2)[:, None]
         behind = met & ~front
         start[open_rays[behind]] += t[behind] + 1e-4

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from pipelines.captures.record import CaptureRecord
+from pipelines.exports.formats import glb
 from pipelines.exports.formats.ply import write_mesh
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.sample.film import phone_camera, walk
@@ -65,6 +66,7 @@ def job(tmp_path: Path) -> Workspace:
     grey, upward = np.full_like(points, 0.5), np.tile([0.0, 0.0, 1.0], (len(points), 1))
     mesh = TriangleMesh(points, np.concatenate(faces).astype(np.int32), grey, upward)
     write_mesh(workspace.stage("mesh") / "mesh.ply", mesh)
+    glb.write_mesh(workspace.stage("mesh") / "mesh.glb", mesh)
     (workspace.stage("report") / "report.json").write_text(json.dumps(REPORT), "utf-8")
     return workspace
 
