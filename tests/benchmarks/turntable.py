@@ -38,8 +38,8 @@ def turntable(
 ) -> NDArray[np.uint8]:
     """[2 side, num_views side, 3] uint8: coloured above, shaded below, all round.
 
-    vertices: [V, 3] world. faces: [F, 3]. colors: [V, 3] in [0, 1], a texture, or None. ball: middle
-    [3] and radius of what is shown, the rest is left out; without it the middle 98 % of the
+    vertices: [V, 3] world. faces: [F, 3]. colors: [V, 3] in [0, 1], a texture, or None. ball:
+    middle [3] and radius of what is shown, the rest is left out; without it the middle 98 % of the
     vertices fill the picture.
     """
     if ball is not None:
