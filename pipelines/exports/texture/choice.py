@@ -130,9 +130,9 @@ def _look(surface: Surface, photos: Photos, index: int, candidates: _Candidates)
     faces, corners, middle = faces[kept], corners[kept], middle[kept]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    photo = photos.load(index)
-    score = area * sharpness(photo)
-    candidates.offer(faces, index, score, colors_at(softened(photo), middle))
+    glance, share = photos.glance(index)
+    score = area * sharpness(glance)
+    candidates.offer(faces, index, score, colors_at(softened(glance), middle * share))
 
 
 def _drop_unlike(candidates: _Candidates) -> None:

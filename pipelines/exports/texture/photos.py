@@ -23,6 +23,7 @@ Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
 _MAX_ANGLE_ERROR = 0.005
+_GLANCE_SIDE = 640
 _SMALL_SIDE = 320
 _BLUR_PX = 1.5
 _USABLE = 128
@@ -74,6 +75,16 @@ class Photos:
         """The photo, RGB."""
         with Image.open(self._root / self._images[index].file) as opened:
             return opened.convert("RGB")
+
+    def glance(self, index: int) -> tuple[Image.Image, NDArray[np.float64]]:
+        """The photo, RGB, at most 640 px long, and its size as a share [2] of the whole one's."""
+        width, height = self.size(index)
+        shrink = min(1.0, _GLANCE_SIDE / max(width, height))
+        small = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        with Image.open(self._root / self._images[index].file) as opened:
+            opened.draft("RGB", small)
+            glance = opened.convert("RGB").resize(small, Image.Resampling.BOX)
+        return glance, np.array([small[0] / width, small[1] / height])
 
     def usable(self, index: int, pixels: Floats) -> Bools:
         """Whether the photo's mask lets pixels [P, 2] count; all of them without a mask."""
