@@ -20,8 +20,7 @@ from pipelines.exports.formats import glb
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import reach_of
 from pipelines.exports.surface.shells import find_shells, fuse_shells
-from pipelines.exports.texture.bake import texture_from_photos
-from pipelines.exports.texture.photos import Photos
+from pipelines.exports.texture.bake import painted
 from pipelines.judging.asset_views import MeshCaster, Texture
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.options import DraftOptions
@@ -67,9 +66,7 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
         )
     if len(mesh.faces) == 0:
         return _nothing(options, ctx, "no two depth maps agree on a surface")
-    skin: TriangleMesh | TexturedMesh = mesh
-    if options.texture == "photos":
-        skin = _painted(mesh, maps, cameras, options, ctx)
+    skin = _painted(mesh, maps, cameras, options, ctx)
     glb.write_mesh(ctx.out / "draft.glb", skin)
     _save_picture(ctx.out / "draft.jpg", skin, probes[len(probes) // 2], shells[0].bounds.focus)
     return {
@@ -120,19 +117,13 @@ def _painted(
     cameras: CamerasFile,
     options: DraftOptions,
     ctx: StageContext,
-) -> TexturedMesh:
-    """The mesh with a picture on it, made of the photos that took part."""
+) -> TriangleMesh | TexturedMesh:
+    """The mesh painted with the photos that took part."""
     named = {image.file: image for image in cameras.images}
     picked = evenly(len(maps), options.num_views or len(maps))
     images = [named[maps.images[index].file] for index in picked]
     lenses = [cameras.cameras[image.camera] for image in images]
-    share = _TEXTURE_SHARE - _FUSE_SHARE
-    return texture_from_photos(
-        mesh,
-        Photos(ctx.workspace.images_root, images, lenses),
-        options.texture_px,
-        lambda done: ctx.progress(_FUSE_SHARE + share * done, "painting", None),
-    )
+    return painted(mesh, images, lenses, options, ctx, (_FUSE_SHARE, _TEXTURE_SHARE))
 
 
 def _save_picture(

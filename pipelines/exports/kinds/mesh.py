@@ -48,10 +48,10 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     """Make the mesh. Raises ExportError `empty_mesh` where the model shows no surface."""
     # Imported where it runs: the API reads this file too.
     from pipelines.exports.formats import glb, ply
+    from pipelines.exports.mesh import TexturedMesh
     from pipelines.exports.surface.shells import find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
-    from pipelines.exports.texture.bake import texture_from_photos
-    from pipelines.exports.texture.photos import Photos
+    from pipelines.exports.texture.bake import painted
     from pipelines.scene.depth_views import Pinhole
 
     ctx.progress(0.0, "looking for the scene's bounds")
@@ -80,23 +80,18 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
     ply.write_mesh(ctx.out / "mesh.ply", mesh)
-    summary: dict[str, Any] = {"texture_px": None}
-    if options.texture == "photos":
-        shown = scene.training_images()
-        photos = Photos(ctx.workspace.images_root, shown, [scene.lens_of(image) for image in shown])
-        share = _TEXTURE_SHARE - _FUSE_SHARE
-        textured = texture_from_photos(
-            mesh,
-            photos,
-            options.texture_px,
-            lambda done: ctx.progress(_FUSE_SHARE + share * done, "painting", None),
-        )
-        glb.write_mesh(ctx.out / "mesh.glb", textured)
-        summary = {"texture_px": len(textured.texture)}
-    else:
-        glb.write_mesh(ctx.out / "mesh.glb", mesh)
+    shown = scene.training_images()
+    skin = painted(
+        mesh,
+        shown,
+        [scene.lens_of(image) for image in shown],
+        options,
+        ctx,
+        (_FUSE_SHARE, _TEXTURE_SHARE),
+    )
+    glb.write_mesh(ctx.out / "mesh.glb", skin)
     return {
-        **summary,
+        "texture_px": len(skin.texture) if isinstance(skin, TexturedMesh) else None,
         "num_vertices": len(mesh.vertices),
         "num_faces": len(mesh.faces),
         "num_views": len(images),

@@ -7,7 +7,7 @@ keep their vertices' colours. Memory: one photo at a time and the picture itself
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
-from pipelines.exports.texture.charts import CELL_PX, Charts, Layout, cut, lay_out
+from pipelines.exports.options import TextureOptions
+from pipelines.exports.texture.charts import CELL_PX, Charts, Layout, TextureFull, cut, lay_out
 from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos
 from pipelines.exports.texture.levelling import levels
 from pipelines.exports.texture.photos import Photos, colors_at, softened
+from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.stage import StageContext
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -33,6 +36,37 @@ _core: Any = open3d.core
 _tensor_geometry: Any = open3d.t.geometry
 
 
+def painted(
+    mesh: TriangleMesh,
+    images: Sequence[PosedImage],
+    lenses: Sequence[Intrinsics],
+    options: TextureOptions,
+    ctx: StageContext,
+    shares: tuple[float, float],
+) -> TriangleMesh | TexturedMesh:
+    """The mesh of a stage, painted with some images of the capture where its options want that.
+
+    shares: of the stage's progress, before and after. A mesh of more faces than the texture has
+    room for stays as it is, with a warning.
+    """
+    if options.texture == "none":
+        return mesh
+    begin, end = shares
+    try:
+        return texture_from_photos(
+            mesh,
+            Photos(ctx.workspace.images_root, images, lenses),
+            options.texture_px,
+            lambda done: ctx.progress(begin + (end - begin) * done, "painting", None),
+        )
+    except TextureFull as error:
+        ctx.logger.warning(
+            "The mesh keeps the colours of its vertices: %s. Raise texture_px, or lower max_faces.",
+            error,
+        )
+        return mesh
+
+
 def texture_from_photos(
     mesh: TriangleMesh,
     photos: Photos,
@@ -41,7 +75,7 @@ def texture_from_photos(
 ) -> TexturedMesh:
     """Paint a mesh of the world. largest_side: of the texture, px, a power of two.
 
-    on_progress: told the share that is done; may raise.
+    on_progress: told the share that is done; may raise. Raises TextureFull.
     """
     vertices = photos.frame.scene_from_world(mesh.vertices)
     surface = Surface(vertices, mesh.faces, mesh.normals)

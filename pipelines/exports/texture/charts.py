@@ -30,6 +30,10 @@ _SHRINK = 0.93
 _LEAST_SCALE = 0.02
 
 
+class TextureFull(ValueError):
+    """More faces than the largest picture has room for."""
+
+
 @dataclass(frozen=True)
 class Charts:
     """faces: [F, 3], corners. vertex: [U], the mesh's vertex of each corner. chart: [U].
@@ -99,7 +103,7 @@ class Layout:
 def lay_out(charts: Charts, size_of: Callable[[int], tuple[int, int]], largest_side: int) -> Layout:
     """Place all charts in the smallest square of a power of two that holds them, or make them fit.
 
-    size_of: width and height of a photo. largest_side: px, a power of two.
+    size_of: width and height of a photo. largest_side: px, a power of two. Raises TextureFull.
     """
     shown = np.flatnonzero(charts.photo != NOBODY).astype(np.int32)
     source = _boxes(charts, shown, size_of)
@@ -112,7 +116,7 @@ def lay_out(charts: Charts, size_of: Callable[[int], tuple[int, int]], largest_s
     while (packed := _packed(size, scale, len(cells), side)) is None:
         scale *= _SHRINK
         if scale < _LEAST_SCALE:
-            raise ValueError(f"{len(charts.face_chart)} faces do not fit into {side} px")
+            raise TextureFull(f"{len(charts.face_chart)} faces do not fit into {side} px")
     target, cells_top = packed
     uv = np.zeros_like(charts.place)
     row = np.full(len(charts.photo), -1)

@@ -11,6 +11,7 @@ import pytest
 from pipelines.errors import Cancelled, ExportError
 from pipelines.exports.formats.glb import is_textured, read_textured
 from pipelines.exports.formats.ply import read_ply
+from pipelines.exports.texture import charts
 from pipelines.manifest import RunHooks
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
@@ -33,7 +34,9 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
     assert files == {"mesh.ply", "mesh.glb", "manifest.json"}
 
 
-def test_the_glb_is_painted_with_the_photos_unless_told_not_to(job: Workspace) -> None:
+def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     summary = tiny_job.run(job, "mesh")["summary"]
     painted = read_textured(job.stage("mesh") / "mesh.glb")
     mesh = read_ply(job.stage("mesh") / "mesh.ply")
@@ -41,9 +44,15 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to(job: Workspace) -
     assert painted.texture.shape[:2] == (summary["texture_px"],) * 2
     corners = painted.vertices[painted.faces]
     assert np.abs(corners - mesh.points[mesh.faces]).max() < 1e-4
-    plain = tiny_job.run(job, "mesh", texture="none")["summary"]
-    assert plain["texture_px"] is None
-    assert not is_textured(job.stage("mesh") / "mesh.glb")
+    for spoil in ({"texture": "none"}, {"texture_px": 512, "max_faces": 100_000}):
+        full = "texture_px" in spoil
+        if full:
+            monkeypatch.setattr(charts, "_LEAST_SCALE", 1.0)
+            monkeypatch.setattr(charts, "_MARGIN_PX", 40)
+        plain = tiny_job.run(job, "mesh", **spoil)["summary"]
+        assert plain["texture_px"] is None
+        assert not is_textured(job.stage("mesh") / "mesh.glb")
+        assert ("keeps the colours of its vertices" in caplog.text) == full
 
 
 def _lie_within(points: np.ndarray, bounds: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.exports.texture.charts import CELL_PX, Charts, cut, lay_out
+from pipelines.exports.texture.charts import CELL_PX, Charts, TextureFull, cut, lay_out
 from pipelines.exports.texture.choice import NOBODY
 
 
@@ -83,5 +83,5 @@ def test_what_can_never_fit_is_refused() -> None:
     places, faces = grid(100)
     choice = np.full(len(faces), NOBODY, np.int32)
     charts = cut(faces, choice, lambda photo, which: places[which])
-    with pytest.raises(ValueError, match="do not fit into 256 px"):
+    with pytest.raises(TextureFull, match="do not fit into 256 px"):
         lay_out(charts, lambda photo: (10, 10), 256)
