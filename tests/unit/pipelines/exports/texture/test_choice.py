@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from pipelines.exports.surface.shells import joined
+from pipelines.exports.texture import photos as photos_module
 from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos, neighbours_of
 from tests.unit.pipelines.exports.texture import painted_ball
 
@@ -61,7 +63,11 @@ def test_what_lies_behind_something_is_not_coloured_through_it(tmp_path: Path) -
     assert shown_behind < 0.02
 
 
-def test_a_hand_in_one_photo_is_voted_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("glance_px", [640, 80])
+def test_a_hand_in_one_photo_is_voted_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, glance_px: int
+) -> None:
+    monkeypatch.setattr(photos_module, "_GLANCE_SIDE", glance_px)
     poses = painted_ball.all_round()
     images = painted_ball.write_photos(tmp_path, poses)
     with Image.open(tmp_path / images[4].file) as opened:
