@@ -35,7 +35,7 @@ from pipelines.sample.film import LONG_SIDE_PX, NUM_FRAMES, phone_camera, walk
 from pipelines.sample.scenes.catalogue import TAKES
 from pipelines.workspace import Workspace
 from tests.benchmarks.geometry_pictures import save_depths, save_turntable
-from tests.benchmarks.geometry_truth import judge_scene, judge_sensor
+from tests.benchmarks.geometry_truth import Compared, judge_scene, judge_sensor
 from tests.benchmarks.machine import describe, heading
 from tests.benchmarks.scene_capture import scene_capture
 from tests.benchmarks.tables import markdown_table, number, write_json
@@ -84,7 +84,7 @@ def judge(name: str, job: Workspace, folder: Path, given: argparse.Namespace) ->
     if name in TAKES:
         take = TAKES[name]
         truth = walk(given.frames, phone_camera(given.long_side), take=take)
-        judged = judge_scene(job, take, truth)
+        judged: tuple[dict[str, Any], Compared] | None = judge_scene(job, take, truth)
     else:
         judged = judge_sensor(job, Path(name))
     folder.mkdir(parents=True, exist_ok=True)

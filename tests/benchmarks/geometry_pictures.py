@@ -13,7 +13,6 @@ from pipelines.exports.formats.ply import read_ply
 from pipelines.judging.asset_views import Texture
 from pipelines.judging.depth_scores import known
 from pipelines.nerf.judging.off_path import evenly
-from pipelines.sample.align import Floats
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.focus import find_focus
 from pipelines.workspace import Workspace
@@ -31,7 +30,7 @@ _COLORS = np.array(
 )
 
 
-def depth_picture(depth: Floats, near: float, far: float) -> NDArray[np.uint8]:
+def depth_picture(depth: NDArray[np.floating], near: float, far: float) -> NDArray[np.uint8]:
     """[H, W, 3]: near yellow, far violet, black where nothing is known."""
     share = np.clip((depth - near) / max(far - near, 1e-9), 0.0, 1.0)
     color = np.stack([np.interp(share, _STOPS, _COLORS[:, k]) for k in range(3)], axis=-1)
@@ -39,7 +38,7 @@ def depth_picture(depth: Floats, near: float, far: float) -> NDArray[np.uint8]:
     return np.rint(color).astype(np.uint8)
 
 
-def error_picture(found: Floats, truth: Floats) -> NDArray[np.uint8]:
+def error_picture(found: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[H, W, 3]: white right, red too near, blue too far, black missing, grey no truth."""
     there, asked = known(found), known(truth)
     off = np.where(there & asked, (found - truth) / np.where(asked, truth, 1.0), 0.0)

@@ -42,8 +42,8 @@ class Compared:
     """
 
     photos: list[NDArray[np.uint8]] = field(default_factory=list)
-    truth: list[Floats] = field(default_factory=list)
-    found: list[Floats] = field(default_factory=list)
+    truth: list[NDArray[np.floating]] = field(default_factory=list)
+    found: list[NDArray[np.floating]] = field(default_factory=list)
 
 
 def cameras_at(lens: Intrinsics, poses: Floats, frame: SceneTransform) -> Cameras:
@@ -64,8 +64,9 @@ def judge_scene(job: Workspace, take: Take, truth: CamerasFile) -> tuple[dict[st
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
     mesh = read_ply(job.stage("mesh") / "mesh.ply")
     poses = judge_poses(cameras, truth)
-    surface = judge_surface(mesh.points, mesh.faces, poses.alignment, truth, take.scene)
-    moved = poses.alignment.apply_to_points(mesh.points.astype(np.float64))
+    points = mesh.points.astype(np.float64)
+    surface = judge_surface(points, mesh.faces, poses.alignment, truth, take.scene)
+    moved = poses.alignment.apply_to_points(points)
     compared = _depth_of_scene(moved, mesh, take, truth)
     return {
         "poses": {

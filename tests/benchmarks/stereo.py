@@ -38,7 +38,10 @@ def read_views(folder: Path, long_side_px: int) -> dict[str, StereoView]:
     lens = Intrinsics(
         int(told["w"]),
         int(told["h"]),
-        *(float(told[key]) for key in ("fl_x", "fl_y", "cx", "cy")),
+        float(told["fl_x"]),
+        float(told["fl_y"]),
+        float(told["cx"]),
+        float(told["cy"]),
         model="OPENCV" if any(terms.values()) else "PINHOLE",
         **terms,
     )

@@ -76,7 +76,7 @@ def test_video_over_http_comes_back_as_assets_true_to_the_scene(
     poses = judge_poses(cameras, truth)
     assert poses.mean_center_error < 0.01, poses
     mesh = read_ply(out / "mesh.ply")
-    judged = judge_mesh(mesh.points, mesh.faces, poses.alignment, truth)
+    judged = judge_mesh(mesh.points.astype(np.float64), mesh.faces, poses.alignment, truth)
     assert judged.accuracy < 0.03, judged
     assert judged.completeness < 0.03, judged
 

@@ -277,7 +277,11 @@ def test_a_worker_hears_the_bell_again_after_redis_was_killed_and_started(
     engine.start_worker()
     for _ in range(2):
         last = engine.submit({"report": {"steps": 5, "step_s": 0.1}})
-        engine.wait(lambda job=last: engine.stage(job, "report").state == "running")
+
+        def is_running(job: str = last) -> bool:
+            return engine.stage(job, "report").state == "running"
+
+        engine.wait(is_running)
         redis_server.kill()
         assert engine.wait_for(last, "succeeded", "failed").state == "succeeded"
         time.sleep(0.5)

@@ -77,7 +77,7 @@ def test_leases_go_by_the_database_s_clock(database: Database) -> None:
 def test_values_and_labels_that_postgresql_is_strict_about(database: Database) -> None:
     with database.session_scope() as session:
         options = {"first": {"bad": float("inf"), "text": "a\x00b\ud800"}}
-        job = make_job(session, labels={"colour": "red"}, options=options).id  # type: ignore[arg-type]
+        job = make_job(session, labels={"colour": "red"}, options=options).id
         claim = claim_stage(session, stage_id(job, "first"), "w", 60.0)
         assert claim is not None
         append_logs(session, claim, ["nul \x00", "half \ud800"])

@@ -194,7 +194,7 @@ def test_only_the_hash_of_a_key_is_kept_and_a_revoked_key_is_unknown(database: D
 def test_values_that_databases_refuse_are_cleaned(database: Database) -> None:
     with database.session_scope() as session:
         options = {"first": {"bad": float("nan"), "text": "a\x00b\ud800"}}
-        job = make_job(session, options=options).id  # type: ignore[arg-type]
+        job = make_job(session, options=options).id
     with database.read_scope() as session:
         assert get_job(session, job).options["first"] == {"bad": None, "text": "ab?"}
 

@@ -13,6 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from skimage.color import xyz2lab
 
+Ink = Literal["C", "M", "Y", "K"]
+INKS: tuple[Ink, ...] = ("C", "M", "Y", "K")
+
 SRGB_XYZ = ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.7141))
 DISPLAY_P3_XYZ = (
     (0.51512, 0.2412, -0.00105),
@@ -77,14 +80,14 @@ def gray_profile(gamma: float) -> bytes:
     return _profile(b"GRAY", b"XYZ ", b"mntr", {b"kTRC": _curve(gamma)})
 
 
-def cmyk_profile(inks: Mapping[Literal["C", "M", "Y", "K"], tuple[int, int, int]]) -> bytes:
+def cmyk_profile(inks: Mapping[Ink, tuple[int, int, int]]) -> bytes:
     """A printer's profile: each full ink alone has an sRGB colour; several multiply."""
     corners = []
     for corner in range(16):
         color = np.ones(3)
-        for bit, ink in zip((8, 4, 2, 1), "CMYK", strict=True):
+        for bit, ink in zip((8, 4, 2, 1), INKS, strict=True):
             if corner & bit:
-                color = color * np.array(inks[ink]) / 255  # type: ignore[index]
+                color = color * np.array(inks[ink]) / 255
         lightness, a, b = xyz2lab(np.array(SRGB_XYZ).T @ _linear(color), illuminant="D50")
         corners.append((lightness * 2.55, a + 128, b + 128))
     grid = np.clip(np.round(corners), 0, 255).astype(np.uint8).tobytes()

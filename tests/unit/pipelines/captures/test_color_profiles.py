@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def plain(mode: str, color: Any, kind: str = "JPEG", seed: int = 0, **save: Any)
     return stream.getvalue()
 
 
-def ingested(root: Path, files: dict[str, bytes | str]) -> tuple[StageContext, list[str]]:
+def ingested(root: Path, files: Mapping[str, bytes | str]) -> tuple[StageContext, list[str]]:
     """The stage's context, and its warnings."""
     ctx = context(root)
     ctx.workspace.capture_file.parent.mkdir(parents=True)

@@ -30,7 +30,7 @@ def scene(seed: int, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
         PIL.Image.fromarray(rng.integers(0, 256, (n, n, 3), np.uint8)).resize(size[::-1], 3)
         for n in (3, 6, 12)
     ]
-    mean = sum(np.asarray(layer, np.float64) for layer in layers) / 3
+    mean = np.mean([np.asarray(layer, np.float64) for layer in layers], axis=0)
     return np.clip(mean + rng.normal(0, 3, mean.shape), 0, 255).astype(np.uint8)
 
 
@@ -83,7 +83,7 @@ def test_depth_maps_are_known_by_their_16_bits(tmp_path: Path) -> None:
 
 
 def test_one_channel_beside_colour_is_no_photo(tmp_path: Path) -> None:
-    noisy = {f"x/{n}.png": encoded(scene(n), mode="L") for n in range(9)}
+    noisy: Files = {f"x/{n}.png": encoded(scene(n), mode="L") for n in range(9)}
     assert taken(tmp_path, photos() | noisy, "9 pictures in x/", "one channel") == list(photos())
 
 
@@ -101,7 +101,7 @@ def test_masks_are_known_by_their_two_values(tmp_path: Path, kind: str, mode: st
 
 def test_label_maps_are_known_by_their_few_colours(tmp_path: Path) -> None:
     colors = np.array([(200, 30, 40), (20, 90, 220), (90, 200, 60), (250, 220, 10)], np.uint8)
-    labels = {
+    labels: Files = {
         f"x/{n}.png": encoded(colors[np.roll(np.arange(160) // 40, n)][None].repeat(120, 0))
         for n in range(9)
     }
@@ -143,7 +143,7 @@ def test_only_masks_and_depth_are_no_capture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("folder", ["masks", "Mask", "depth", "scan/confidence", "x_normals"])
 def test_folders_beside_photos_speak(tmp_path: Path, folder: str) -> None:
-    colored = {f"{folder}/{n}.jpg": encoded(scene(50 + n), "JPEG") for n in range(9)}
+    colored: Files = {f"{folder}/{n}.jpg": encoded(scene(50 + n), "JPEG") for n in range(9)}
     assert taken(tmp_path, photos() | colored, f"9 pictures in {folder}/") == list(photos())
 
 

@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -37,7 +38,7 @@ def zip_of(target: Path, folder: Path, files: Iterable[Path]) -> Path:
     )
 
 
-def prepared(tmp_path: Path, source: Path) -> tuple[Workspace, dict[str, object]]:
+def prepared(tmp_path: Path, source: Path) -> tuple[Workspace, dict[str, Any]]:
     """The workspace after `frames`, and what ingest said."""
     workspace = Workspace(tmp_path / "job")
     workspace.capture_file.parent.mkdir(parents=True)

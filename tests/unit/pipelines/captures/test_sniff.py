@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.captures.sniff import ArchiveLimits, sniff
+from pipelines.captures.archive_rules import ArchiveLimits
+from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError
 from tests.unit.pipelines.captures.archives import (
     nerfstudio_files,

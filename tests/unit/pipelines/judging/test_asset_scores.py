@@ -25,6 +25,7 @@ def test_a_perfect_mesh_with_a_hole_scores_its_hole_alone() -> None:
     holed = MeshCaster(*wall(hole=0.5)[:2], colors).view(camera(), 0)
     scores = score_view(holed, photo)
     assert scores["coverage"] == pytest.approx(0.75, abs=0.01)
+    assert scores["psnr"] is not None
     assert scores["psnr"] > 60.0
     assert scores["ssim"] == pytest.approx(1.0, abs=1e-4)
     error = np.where(holed.hit[..., None], 0.0, photo - 0.5)

@@ -27,7 +27,7 @@ from pipelines.nerf.training.checkpoint import load_model, save_model
 from pipelines.nerf.training.loop import train
 from pipelines.options import OptionsError, resolve_options, train_config, train_options
 from tests.unit.pipelines.nerf.models.toy_runs import SCENE, same_state
-from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images
+from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
 TOY_MODULE = '''
 """A method that knows one colour and one density, and three parts."""
@@ -253,7 +253,7 @@ def test_what_nobody_offers_is_refused_with_the_names_there_are() -> None:
         ("position_encoding", "hash, vm, cp, voxel, fourier"),
     ):
         with pytest.raises(NerfError, match=allowed):
-            validate(replace(base, model=replace(base.model, **{name: "tanh"})))
+            validate(with_model(base, **{name: "tanh"}))
 
 
 @pytest.mark.usefixtures("toy")

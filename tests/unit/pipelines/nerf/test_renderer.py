@@ -15,7 +15,11 @@ from pipelines.nerf.options.parts import HashGridConfig
 from pipelines.nerf.options.render import ALL_SAMPLES, RenderConfig
 from pipelines.nerf.renderer import RenderedImage, Renderer, pixels_in_blocks
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
-from tests.unit.pipelines.nerf.engines.cpu.parts.test_hash_grid import assert_close, random_model
+from tests.unit.pipelines.nerf.engines.cpu.parts.test_hash_grid import (
+    assert_close,
+    last_layer,
+    random_model,
+)
 
 SCENE = SceneTransform(center=(1.0, 2.0, 3.0), scale=0.25)
 
@@ -115,7 +119,7 @@ def test_a_model_in_training_goes_on_training_and_is_read_anew() -> None:
     before = renderer.render(two_cameras(), 0)
     assert model.training
     with torch.no_grad():
-        model.field.color_mlp.layers[-1].bias += 1.0
+        last_layer(model.field.color_mlp).bias.add_(1.0)
     assert (renderer.render(two_cameras(), 0).rgb > before.rgb).mean() > 0.99
 
 

@@ -66,12 +66,12 @@ def toy_images(cameras: Cameras) -> ImageData:
     return ImageData.from_arrays(images)
 
 
-def tiny_config(**changes: object) -> TrainConfig:
-    """A whole configuration small enough for dozens of steps a second."""
+def tiny_model() -> NerfactoConfig:
+    """A model small enough for dozens of steps a second."""
     proposal = ProposalConfig(
         grid=HashGridConfig(num_levels=3, min_res=8, max_res=32, log2_table_size=12), hidden_dim=8
     )
-    model = NerfactoConfig(
+    return NerfactoConfig(
         num_proposal_samples=(24, 16),
         num_nerf_samples=12,
         proposals=(proposal, proposal),
@@ -85,12 +85,16 @@ def tiny_config(**changes: object) -> TrainConfig:
         average_init_density=1.0,
         anneal_steps=40,
     )
+
+
+def tiny_config(**changes: object) -> TrainConfig:
+    """A whole run of `tiny_model`."""
     values: dict[str, object] = {
         "max_steps": 80,
         "rays_per_step": 256,
         "device": "cpu",
         "engine": "plain",
-        "model": model,
+        "model": tiny_model(),
         "data": DataConfig(long_side_px=SIZE),
         "optimizer": OptimizerConfig(decay_steps=1000),
     }

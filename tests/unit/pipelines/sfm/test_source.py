@@ -115,10 +115,10 @@ def test_two_lenses_of_one_phone_stay_two_through_ingest(tmp_path: Path) -> None
 def test_colmap_starts_from_the_focal_length_of_the_photos(tmp_path: Path) -> None:
     """From the zip to COLMAP's database; a photo without EXIF has no prior."""
     tags = [phone_exif(5.7, 26)] * 6 + [phone_exif(1.6, 13)] * 2 + [None]
-    files = {
-        f"{n}.jpg": picture(400, 300, seed=n, **({"exif": exif} if exif else {}))
-        for n, exif in enumerate(tags)
-    }
+    files = {}
+    for n, exif in enumerate(tags):
+        told: dict[str, Any] = {"exif": exif} if exif else {}
+        files[f"{n}.jpg"] = picture(400, 300, seed=n, **told)
     source = ingested(tmp_path, files)
     reconstructor = Reconstructor(tmp_path / "c.db", source.paths, tmp_path / "s", num_threads=1)
     settings = FeatureSettings(400, 500, upsample=False, num_threads=1)
@@ -187,5 +187,6 @@ def test_a_compact_cameras_photos_have_the_focal_length_colmap_reads(tmp_path: P
         "KODAK Z612 ZOOM DIGITAL CAMERA",
         5.85,
     )
-    by_colmap = pycolmap.Bitmap.read(str(photos[0]), False).exif_focal_length()
-    assert group.focal_px == pytest.approx(by_colmap, rel=1e-3)
+    by_colmap = pycolmap.Bitmap.read(str(photos[0]), False)
+    assert by_colmap is not None
+    assert group.focal_px == pytest.approx(by_colmap.exif_focal_length(), rel=1e-3)

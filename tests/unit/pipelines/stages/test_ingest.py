@@ -75,9 +75,11 @@ def test_transparent_and_deep_pictures_become_plain_rgb(tmp_path: Path) -> None:
     values[:10, :10] = 65535
     PIL.Image.fromarray(values).save(deep, "PNG")
     frames = nerfstudio_files(4)
-    files = {name.replace(".jpg", ".png"): clear.getvalue() for name in frames if "images/" in name}
-    files = {**files, "images/3.png": deep.getvalue(), "transforms.json": frames["transforms.json"]}
-    files["transforms.json"] = str(files["transforms.json"]).replace(".jpg", ".png")
+    files: Files = {
+        name.replace(".jpg", ".png"): clear.getvalue() for name in frames if "images/" in name
+    }
+    files["images/3.png"] = deep.getvalue()
+    files["transforms.json"] = str(frames["transforms.json"]).replace(".jpg", ".png")
     _, ctx = ingest(tmp_path, files)
     for name in ("00001.png", "00004.png"):
         with PIL.Image.open(ctx.out / "images" / name) as image:
@@ -114,7 +116,7 @@ def test_fewer_photos_than_poses_can_use_are_refused_at_once(tmp_path: Path) -> 
 
 
 def test_posed_captures_need_what_training_needs(tmp_path: Path) -> None:
-    assert train.MIN_POSED_IMAGES == MIN_POSED_IMAGES
+    assert vars(train)["MIN_POSED_IMAGES"] == MIN_POSED_IMAGES
     assert code_of(tmp_path / "a", nerfstudio_files(MIN_POSED_IMAGES - 1)) == "too_few_images"
     summary, _ = ingest(tmp_path / "b", nerfstudio_files(MIN_POSED_IMAGES))
     assert summary["num_posed"] == MIN_POSED_IMAGES

@@ -76,11 +76,12 @@ def test_all_splits_become_one_posed_capture(tmp_path: Path) -> None:
 
 def test_the_world_is_kept_and_its_up_is_z(tmp_path: Path) -> None:
     files = blender_files(train=4)
-    turned = [[0.6, 0, 0.8, 1], [0.8, 0, -0.6, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
+    turned: list[list[float]] = [[0.6, 0, 0.8, 1], [0.8, 0, -0.6, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
     top = json.loads(str(files["transforms_train.json"]))
     top["frames"][1]["transform_matrix"] = turned
     _, ctx = ingest(tmp_path, files | {"transforms_train.json": json.dumps(top)})
-    np.testing.assert_allclose(cameras(ctx).images[1].world_from_camera, turned[:3], atol=1e-12)
+    kept = np.array(cameras(ctx).images[1].world_from_camera)
+    np.testing.assert_allclose(kept, turned[:3], atol=1e-12)
 
 
 def test_what_is_transparent_becomes_white_and_the_notes_say_so(tmp_path: Path) -> None:

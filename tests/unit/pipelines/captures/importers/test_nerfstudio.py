@@ -12,6 +12,8 @@ import PIL.Image
 import pytest
 
 from pipelines.errors import CaptureError
+from pipelines.sample.film import phone_camera, walk
+from pipelines.sample.scene import pose_matrix
 from tests.unit.pipelines.captures.archives import (
     depth_exr,
     depth_png,
@@ -262,10 +264,10 @@ def test_picture_listed_twice_keeps_its_first_pose_and_is_told(tmp_path: Path) -
 
 
 def test_what_the_file_says_and_nobody_heeds_is_told(tmp_path: Path) -> None:
-    top = {
+    top: dict[str, Any] = {
         "train_filenames": ["images/0.jpg"],
         "ply_file_path": "sparse_pc.ply",
-        "orientation_override": "none",
+        "orientation_override": "pca",
     }
     files = nerfstudio_files(**top) | {"sparse_pc.ply": "ply"}
     files |= {f"images_2/{n}.jpg": picture(32, 24, seed=n) for n in range(4)}
@@ -314,7 +316,7 @@ def test_depth_unit_and_applied_scale_multiply_and_a_frame_has_its_own(tmp_path:
     for n, frame in enumerate(frames):
         frame["depth_file_path"] = f"depth/{n}.png"
     frames[1]["depth_unit_scale_factor"] = 0.5
-    top = {"frames": frames, "depth_unit_scale_factor": 0.01, "applied_scale": 0.25}
+    top: dict[str, Any] = {"frames": frames, "depth_unit_scale_factor": 0.01, "applied_scale": 0.25}
     _, ctx = ingest(tmp_path, with_depth(**top))
     np.testing.assert_allclose(depth_of(ctx, 0), COUNTS * 0.0025, rtol=1e-6)
     np.testing.assert_allclose(depth_of(ctx, 1), COUNTS * 0.125, rtol=1e-6)
@@ -397,3 +399,40 @@ def test_depth_in_openexr_and_of_the_cameras_size(tmp_path: Path) -> None:
     files = nerfstudio_files(frames=frames) | {"z.exr": depth_exr(values)}
     _, ctx = ingest(tmp_path, files)
     np.testing.assert_allclose(depth_of(ctx, 3), values, rtol=1e-3)
+
+
+def lying(count: int = 8, **top: Any) -> dict[str, bytes | str]:
+    """A walk around the sample's table in a world whose +Y is up."""
+    files = nerfstudio_files(count, **top)
+    transforms = json.loads(files["transforms.json"])
+    walked = walk(count, phone_camera(64)).images
+    for frame, image in zip(transforms["frames"], walked, strict=True):
+        laid = Y_UP @ pose_matrix(image)[:3]
+        frame["transform_matrix"] = [*laid.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    return {**files, "transforms.json": json.dumps(transforms)}
+
+
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def test_a_world_that_lies_is_turned_upright_and_told(tmp_path: Path) -> None:
+    summary, ctx = ingest(tmp_path, lying())
+    warning_with(summary, "+Y", "turned")
+    file = cameras(ctx)
+    for found, image in zip(file.images, walk(8, phone_camera(64)).images, strict=True):
+        np.testing.assert_allclose(found.world_from_camera, pose_matrix(image)[:3], atol=1e-9)
+    assert file.notes["up"] == "+Y"
+    np.testing.assert_allclose(np.array(file.notes["applied_transform"])[:, :3], Y_UP.T)
+
+
+def test_a_turn_comes_on_top_of_what_was_applied_before(tmp_path: Path) -> None:
+    before = [[0.0, 1.0, 0.0, 2.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 3.0]]
+    _, ctx = ingest(tmp_path, lying(applied_transform=before))
+    found = np.array(cameras(ctx).notes["applied_transform"])
+    np.testing.assert_allclose(found, Y_UP.T @ np.array(before))
+
+
+def test_a_file_that_says_it_is_upright_is_believed(tmp_path: Path) -> None:
+    summary, ctx = ingest(tmp_path, lying(orientation_override="none"))
+    assert not any("turned" in warning for warning in summary["warnings"])
+    assert "up" not in cameras(ctx).notes

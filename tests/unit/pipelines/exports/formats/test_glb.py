@@ -88,7 +88,7 @@ def test_colors_are_linear_and_the_material_is_unlit_and_two_sided(file: Path) -
 
 
 def test_open3d_reads_the_same_mesh(file: Path) -> None:
-    mesh = open3d.io.read_triangle_mesh(str(file))
+    mesh = open3d.io.read_triangle_mesh(file)
     assert len(mesh.triangles) == 4
     assert mesh.has_vertex_colors()
     read = np.asarray(mesh.vertices)
@@ -155,7 +155,7 @@ def test_a_textured_document_is_as_the_specification_wants_it(textured: Path) ->
 
 
 def test_open3d_reads_a_textured_mesh(textured: Path) -> None:
-    mesh = open3d.io.read_triangle_mesh(str(textured))
+    mesh = open3d.io.read_triangle_mesh(textured)
     assert len(mesh.triangles) == 4
     assert mesh.has_triangle_uvs()
 

@@ -46,7 +46,7 @@ def test_no_points_at_all_can_be_written_and_read(tmp_path: Path) -> None:
 
 def test_a_mesh_comes_back_with_its_faces(tmp_path: Path) -> None:
     vertices, colors, normals = _cloud(50)
-    faces = np.random.default_rng(1).integers(0, 50, size=(80, 3))
+    faces = np.random.default_rng(1).integers(0, 50, size=(80, 3), dtype=np.int32)
     write_mesh(tmp_path / "m.ply", TriangleMesh(vertices, faces, colors / 255.0, normals))
     back = read_ply(tmp_path / "m.ply")
     np.testing.assert_array_equal(back.points, vertices)

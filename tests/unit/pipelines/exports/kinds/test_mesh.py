@@ -27,7 +27,7 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
     assert mesh.normals is not None
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-4)
     _lie_within(mesh.points, [summary["bounds"], *summary["shells"]][-1])
-    glb = np.asarray(open3d.io.read_triangle_mesh(str(job.stage("mesh") / "mesh.glb")).vertices)
+    glb = np.asarray(open3d.io.read_triangle_mesh(job.stage("mesh") / "mesh.glb").vertices)
     np.testing.assert_allclose(glb[:, 1].min(), mesh.points[:, 2].min(), atol=1e-4)
     np.testing.assert_allclose(glb[:, 2].max(), -mesh.points[:, 1].min(), atol=1e-4)
     files = {path.name for path in job.stage("mesh").iterdir()}

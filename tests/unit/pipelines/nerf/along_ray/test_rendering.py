@@ -184,4 +184,5 @@ def test_the_normal_of_an_empty_ray_is_zero_and_harmless() -> None:
     found = composite_normals(torch.tensor([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]), weights)
     found.sum().backward()
     assert torch.equal(found, torch.zeros(1, 3))
+    assert weights.grad is not None
     assert torch.equal(weights.grad, torch.zeros(1, 2))

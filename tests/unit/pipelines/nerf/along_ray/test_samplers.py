@@ -92,9 +92,7 @@ def test_proposals_gather_the_samples_at_a_surface() -> None:
 def test_every_round_is_jittered_anew_in_the_precision_of_the_rays(
     single_jitter: bool, exponent: float
 ) -> None:
-    rays = Rays(
-        *(item.double() for item in (_rays(5).origins, _rays(5).directions)), torch.arange(5)
-    )
+    rays = Rays(_rays(5).origins.double(), _rays(5).directions.double(), torch.arange(5))
     density = [lambda points: points.norm(dim=-1), lambda points: 2.0 + points[..., 0]]
     final, rounds, weights = sample_proposals(
         rays,

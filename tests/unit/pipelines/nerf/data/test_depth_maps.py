@@ -37,7 +37,7 @@ def exact_maps(cameras: Cameras, scale: float = 1.0) -> DepthMaps:
         _, distance = toy_color(rays)
         forward = -cameras.scene_from_camera[index, :, 2]
         z = torch.where(distance.isfinite(), distance * (rays.directions @ forward), 0.0)
-        maps.append(z.reshape(SIZE, SIZE).numpy() / scale)
+        maps.append((z / scale).reshape(SIZE, SIZE).numpy())
     return DepthMaps.from_arrays(maps, [LENS] * len(cameras), scale)
 
 

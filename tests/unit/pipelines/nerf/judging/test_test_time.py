@@ -67,7 +67,7 @@ def toy() -> Toy:
     colors = plain.pixels.reshape(len(cameras), SIZE * SIZE, 3).float() / 255.0
     images = _with_pixels(plain, (colors * gains).reshape(-1, 3))
     config = tiny_config(max_steps=300, engine="fast")
-    config = replace(config, model=replace(config.model, camera_mode="off"))  # type: ignore[type-var]
+    config = replace(config, model=replace(config.model, camera_mode="off"))
     training = [index for index in range(len(cameras)) if index % 6]
     model = train(images, cameras, training, config, seed=0)
     with torch.no_grad():

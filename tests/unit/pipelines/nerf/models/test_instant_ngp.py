@@ -217,6 +217,7 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(capture: Capture, tmp_path: 
     train(images, cameras, learned, replace(config, max_steps=11), seed=1, checkpoint_path=path)
     resumed = train(images, cameras, learned, config, seed=1, checkpoint_path=path)
     assert same_state(whole, resumed)
+    assert isinstance(whole, InstantNgp)
     assert not bool(whole.occupancy.occupied.all())
 
 

@@ -16,13 +16,11 @@ from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.networks.encodings import HashGrid
 from pipelines.nerf.options.methods.instant_ngp import InstantNgpConfig
 from pipelines.nerf.options.methods.nerf import NerfConfig
-from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
 from pipelines.nerf.options.parts import ModelConfig
 from pipelines.nerf.space.rays import Rays
-from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras
+from tests.unit.pipelines.nerf.toy_scene import tiny_model, toy_cameras
 
-TINY = tiny_config().model
-assert isinstance(TINY, NerfactoConfig)
+TINY = tiny_model()
 WEIGHTS = {
     "camera_translation_penalty": 0.31,
     "camera_rotation_penalty": 0.17,
@@ -140,17 +138,17 @@ def test_a_term_without_weight_is_left_out_and_the_others_stay(
 def test_the_other_methods_add_colours_and_camera_penalties(
     kind: type[Model], config: type[ModelConfig], penalties: bool
 ) -> None:
-    small: dict[str, object] = {
+    own: dict[type[ModelConfig], dict[str, object]] = {
         NerfConfig: {"num_layers": 2, "hidden_dim": 16, "num_coarse_samples": 8},
         InstantNgpConfig: {"grid": TINY.grid, "num_steps": 64, "occupancy_resolution": 16},
-    }[config]
+    }
     cameras = {
         "camera_mode": "so3xr3" if penalties else "off",
         "camera_translation_penalty": 0.31,
         "camera_rotation_penalty": 0.17,
     }
     torch.manual_seed(0)
-    model = _shaken(kind(config(**small, **cameras), 3))  # type: ignore[arg-type]
+    model = _shaken(kind(config(**own[config], **cameras), 3))  # type: ignore[arg-type]
     outputs = model(_rays(), generator=torch.Generator().manual_seed(2))
     losses = {name: float(loss.detach()) for name, loss in model.loss_dict(outputs, TRUTH).items()}
     expected = {"rgb": _mean_square(outputs["rgb"])}

@@ -17,9 +17,9 @@ from pipelines.nerf.networks.fields import MLP, DensityField, NerfactoField, tru
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
 from pipelines.nerf.space.harmonics import spherical_harmonics
 from pipelines.nerf.space.rays import Rays
-from tests.unit.pipelines.nerf.toy_scene import tiny_config
+from tests.unit.pipelines.nerf.toy_scene import tiny_model
 
-CONFIG = tiny_config().model
+CONFIG = tiny_model()
 
 
 def _rays(num: int = 20) -> Rays:
@@ -41,6 +41,7 @@ def test_truncated_exp_is_exp_with_a_bounded_gradient() -> None:
     values = truncated_exp(logits)
     assert torch.equal(values, torch.exp(logits))
     values.sum().backward()
+    assert logits.grad is not None
     assert torch.equal(logits.grad, torch.exp(logits.detach().clamp(-15, 15)))
 
 
@@ -165,7 +166,7 @@ def test_camera_corrections_apply_in_training_alone() -> None:
     model = _model()
     before = model.eval()(_rays())["rgb"]
     with torch.no_grad():
-        model.cameras_delta.tangent += 0.3
+        model.cameras_delta.tangent.add_(0.3)
     assert torch.equal(model.eval()(_rays())["rgb"], before)
     assert not torch.allclose(model.train()(_rays())["samples"][-1].s_edges, before.new_zeros(1))
     colors = model.train()(_rays())["rgb"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ def _points() -> torch.Tensor:
     return torch.rand(4, 6, 3, generator=generator, dtype=torch.float64) * 2.0 - 1.0
 
 
-def _moved(**options: int) -> TemporalDistortion:
+def _moved(**options: Any) -> TemporalDistortion:
     """A distortion whose last layer is no longer zero."""
     torch.manual_seed(1)
     distortion = TemporalDistortion(hidden_dim=8, num_frequencies=2, **options).double()
@@ -36,7 +37,10 @@ def test_the_scene_starts_out_still_and_can_learn_to_move() -> None:
     offsets = distortion(_points(), TIMES)
     assert torch.equal(offsets, torch.zeros(4, 6, 3, dtype=torch.float64))
     offsets.sum().backward()
-    assert bool(distortion.layers[-1].weight.grad.abs().sum() > 0.0)
+    last = distortion.layers[-1]
+    assert isinstance(last, torch.nn.Linear)
+    assert last.weight.grad is not None
+    assert bool(last.weight.grad.abs().sum() > 0.0)
 
 
 def test_nothing_moves_at_time_zero_whatever_was_learned() -> None:
@@ -89,7 +93,7 @@ def test_a_scene_learns_a_known_motion() -> None:
 
 
 @pytest.mark.parametrize("options", [{"num_layers": 1}, {"hidden_dim": 0}])
-def test_a_network_that_cannot_be_is_refused(options: dict[str, int]) -> None:
+def test_a_network_that_cannot_be_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(NerfError) as caught:
         TemporalDistortion(**options)
     assert caught.value.code == "bad_config"

@@ -137,8 +137,8 @@ def test_voxels_represent_a_trilinear_function_exactly() -> None:
         x, y, z = i / 3, j / 3, k / 3
         grid.vertices.data[i, j, k, 0] = 1.0 + 2.0 * x - 3.0 * y + z + 4.0 * x * y * z
     points = torch.rand(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    x, y, z = points.unbind(-1)
-    expected = 1.0 + 2.0 * x - 3.0 * y + z + 4.0 * x * y * z
+    xs, ys, zs = points.unbind(-1)
+    expected = 1.0 + 2.0 * xs - 3.0 * ys + zs + 4.0 * xs * ys * zs
     assert torch.allclose(grid(points)[:, 0], expected, rtol=1e-12)
 
 
@@ -150,7 +150,8 @@ def test_refining_to_a_nested_grid_changes_no_value(kind: type[Encoding]) -> Non
     encoding.upsample(10)  # three new cells in each old one
     assert encoding.resolution == 10
     assert torch.allclose(encoding(points), before, atol=1e-12)
-    for kept, value in zip(old, encoding.parameters(), strict=True):
+    for kept, parameter in zip(old, encoding.parameters(), strict=True):
+        value: torch.Tensor = parameter
         for axis in range(value.dim() - 1):
             if value.shape[axis] == 10:
                 value = value.index_select(axis, torch.tensor([0, 3, 6, 9]))
@@ -175,7 +176,9 @@ def test_refined_grids_learn_and_load(kind: type[Encoding]) -> None:
     encoding.upsample(6)
     points = _points(10)
     encoding(points).sum().backward()
-    assert all(bool(value.grad.abs().sum() > 0) for value in encoding.parameters())
+    for value in encoding.parameters():
+        assert value.grad is not None
+        assert bool(value.grad.abs().sum() > 0)
     copy = kind(6, 3).double()
     copy.load_state_dict(encoding.state_dict())
     assert torch.equal(copy(points), encoding(points))

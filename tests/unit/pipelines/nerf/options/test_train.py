@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
+from typing import Any, cast
 
 import pytest
 
@@ -17,6 +18,7 @@ from pipelines.nerf.options.parts import HashGridConfig
 from pipelines.nerf.options.train import OptimizerConfig, TrainConfig, config_from_dict, validate
 
 DEFAULT = TrainConfig()
+MODEL = cast(NerfactoConfig, DEFAULT.model)
 
 
 def test_the_defaults_are_valid_and_survive_json() -> None:
@@ -25,16 +27,14 @@ def test_the_defaults_are_valid_and_survive_json() -> None:
 
 
 def test_one_shared_network_may_serve_all_rounds() -> None:
-    one = DEFAULT.model.proposals[:1]
-    validate(
-        replace(DEFAULT, model=replace(DEFAULT.model, proposals=one, share_proposal_network=True))
-    )
+    one = MODEL.proposals[:1]
+    validate(replace(DEFAULT, model=replace(MODEL, proposals=one, share_proposal_network=True)))
 
 
 @pytest.mark.parametrize(
     ("model", "named"),
     [
-        ({"proposals": DEFAULT.model.proposals[:1]}, "at least the 2 rounds"),
+        ({"proposals": MODEL.proposals[:1]}, "at least the 2 rounds"),
         ({"near": 5.0, "far": 5.0}, r"less than far \(5.0\)"),
         ({"contraction": "sphere"}, "linf, l2, none"),
         ({"num_proposal_samples": (256, 0)}, "1 to 4096"),
@@ -51,7 +51,7 @@ def test_one_shared_network_may_serve_all_rounds() -> None:
     ],
 )
 def test_wrong_options_are_refused_by_name(model: dict[str, object], named: str) -> None:
-    config = replace(DEFAULT, model=replace(DEFAULT.model, **model))  # type: ignore[arg-type]
+    config = replace(DEFAULT, model=replace(MODEL, **model))  # type: ignore[arg-type]
     with pytest.raises(NerfError, match=named) as caught:
         validate(config)
     assert caught.value.code == "bad_config"
@@ -70,14 +70,14 @@ def test_the_finest_grids_allowed_are_those_that_fit(
     fits, too_many = largest
     assert fits <= MAX_GRID_VALUES < too_many
     grid = TensorGridConfig(resolution, components)
-    model = replace(DEFAULT.model, position_encoding=encoding, tensor_grid=grid)
+    model = replace(MODEL, position_encoding=encoding, tensor_grid=grid)
     validate(replace(DEFAULT, model=model))
 
 
 @pytest.mark.parametrize("encoding", ["hash", "cp", "fourier"])
 def test_encodings_without_dense_grids_may_be_as_fine_as_they_like(encoding: str) -> None:
     grid = TensorGridConfig(2048, 512)
-    model = replace(DEFAULT.model, position_encoding=encoding, tensor_grid=grid)
+    model = replace(MODEL, position_encoding=encoding, tensor_grid=grid)
     validate(replace(DEFAULT, model=model))
 
 
@@ -89,9 +89,7 @@ def test_encodings_without_dense_grids_may_be_as_fine_as_they_like(encoding: str
         ({"beta2": 0.8}, "0.9 to 0.999999"),
     ],
 )
-def test_an_adam_that_would_divide_by_nothing_is_refused(
-    rates: dict[str, float], named: str
-) -> None:
+def test_an_adam_that_would_divide_by_nothing_is_refused(rates: dict[str, Any], named: str) -> None:
     with pytest.raises(NerfError, match=named):
         validate(replace(DEFAULT, optimizer=OptimizerConfig(**rates)))
 

@@ -96,6 +96,7 @@ def test_gradients_are_right_and_finite_at_the_origin(contract, uncontract) -> N
     assert torch.autograd.gradcheck(contract, (points,))
     origin = torch.zeros(1, 3, requires_grad=True)
     contract(origin).sum().backward()
+    assert origin.grad is not None
     assert torch.equal(origin.grad, torch.ones(1, 3))
 
 

@@ -138,11 +138,11 @@ def test_steps_are_those_that_the_worst_lens_needs() -> None:
     assert bool(folding.image_rays(0).directions.isfinite().all())
 
 
-class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]
+class Count(TorchDispatchMode):
     """Operations that a device has to start: all but views."""
 
     def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
+        super().__init__()
         self.operations = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

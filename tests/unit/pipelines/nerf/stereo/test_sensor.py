@@ -72,16 +72,16 @@ def test_a_scale_is_only_changed_on_evidence() -> None:
     assert sensor_scale(maps, [None] * len(maps)).spread is None
 
 
-def test_stereo_tells_where_it_knows_elsewhere_the_sensor() -> None:
+def test_stereo_is_finer_unless_it_is_far_off() -> None:
     stereo = DepthMap(
         np.array([[2.0, 2.0, 0.0, 2.0, 0.0]], np.float32), np.array([[4, 5, 0, 2, 0]], np.uint8)
     )
     sensor = DepthMap(
-        np.array([[2.01, 3.0, 2.5, 0.0, 0.0]], np.float32), np.array([[6, 1, 2, 0, 0]], np.uint8)
+        np.array([[2.08, 3.0, 2.5, 0.0, 0.0]], np.float32), np.array([[6, 1, 2, 0, 0]], np.uint8)
     )
     both = merged(stereo, sensor)
-    assert both.z.tolist() == [[2.0, 2.0, 2.5, 2.0, 0.0]]
-    assert both.votes.tolist() == [[4, 5, 2, 2, 0]]
+    assert both.z.tolist() == [[2.0, 3.0, 2.5, 2.0, 0.0]]
+    assert both.votes.tolist() == [[4, 1, 2, 2, 0]]
 
 
 def test_sensor_points_lie_on_what_it_saw() -> None:

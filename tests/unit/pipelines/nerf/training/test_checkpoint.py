@@ -21,13 +21,13 @@ from pipelines.nerf.training.checkpoint import (
     save_checkpoint,
     save_model,
 )
-from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras
+from tests.unit.pipelines.nerf.toy_scene import tiny_config, tiny_model, toy_cameras
 
 SCENE = SceneTransform((4_500_000.25, -2.0, 0.5), 0.125)
 
 
 def test_a_loaded_model_renders_the_same(tmp_path: Path) -> None:
-    model = Nerfacto(tiny_config().model, 5).eval()
+    model = Nerfacto(tiny_model(), 5).eval()
     path = tmp_path / "model.zip"
     save_model(path, model, SCENE, {"cameras": [{"file": "a.jpg"}], "metric": True})
     loaded = load_model(path)
@@ -43,7 +43,7 @@ def test_a_loaded_model_renders_the_same(tmp_path: Path) -> None:
 
 def test_damaged_and_foreign_models_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.zip"
-    save_model(path, Nerfacto(tiny_config().model, 5), SCENE, {})
+    save_model(path, Nerfacto(tiny_model(), 5), SCENE, {})
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(NerfError, match="damaged"):
@@ -57,7 +57,7 @@ def test_damaged_and_foreign_models_are_refused(tmp_path: Path) -> None:
 
 def test_a_model_of_another_shape_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.zip"
-    save_model(path, Nerfacto(tiny_config().model, 5), SCENE, {})
+    save_model(path, Nerfacto(tiny_model(), 5), SCENE, {})
     with zipfile.ZipFile(path) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
     description = json.loads(entries["model.json"])

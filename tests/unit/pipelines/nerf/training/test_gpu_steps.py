@@ -26,7 +26,7 @@ from pipelines.nerf.training import gpu_steps, loop
 from pipelines.nerf.training.checkpoint import load_checkpoint
 from pipelines.nerf.training.gpu_steps import GpuSteps
 from pipelines.nerf.training.loop import TrainProgress, train
-from pipelines.nerf.training.state import TrainingState
+from pipelines.nerf.training.state import TrainingState, initial_state
 from tests.unit.pipelines.nerf.engines.gpu.taped_graphs import Tape, TapedGraphs
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
@@ -51,7 +51,8 @@ def config_of(engine: str) -> TrainConfig:
 
 
 def run(config: TrainConfig, **given: Any) -> tuple[Model, list[TrainProgress]]:
-    cameras, told = toy_cameras(6), []
+    cameras = toy_cameras(6)
+    told: list[TrainProgress] = []
     model = train(
         toy_images(cameras), cameras, range(6), config, seed=2, on_progress=told.append, **given
     )
@@ -78,7 +79,7 @@ def with_engine(monkeypatch: pytest.MonkeyPatch, spoil: Spoil) -> TapedGraphs:
 
     monkeypatch.setattr(loop, "_gpu_steps", chosen)
     # On a CPU "auto" means numba's kernels, which cannot be taped.
-    make = loop.initial_state
+    make = initial_state
     monkeypatch.setattr(
         loop, "initial_state", lambda config, *rest: make(replace(config, engine="plain"), *rest)
     )
@@ -201,7 +202,7 @@ def test_memory_that_runs_out_is_no_fault_of_the_engine(monkeypatch: pytest.Monk
         def forward(*args: Any, **kwargs: Any) -> None:
             raise torch.OutOfMemoryError("CUDA out of memory")
 
-        state.model.forward = forward  # type: ignore[method-assign]
+        state.model.forward = forward  # type: ignore[method-assign,assignment]
 
     with_engine(monkeypatch, spoil)
     with pytest.raises(torch.OutOfMemoryError):

@@ -141,7 +141,7 @@ def test_a_run_goes_on_with_another_limit_habit_or_rate(
 
 @pytest.mark.parametrize("rates", [{"eps": 0.5}, {"beta2": 0.9}, {"lr": 1e-4, "lr_final": 1e-4}])
 def test_what_may_change_takes_effect(
-    images: ImageData, cameras: Cameras, begun: Path, rates: dict[str, float], tmp_path: Path
+    images: ImageData, cameras: Cameras, begun: Path, rates: dict[str, Any], tmp_path: Path
 ) -> None:
     results: list[Model] = []
     for optimizer in (BASE.optimizer, replace(BASE.optimizer, **rates)):
@@ -205,7 +205,7 @@ def test_previews_change_nothing_of_the_run(images: ImageData, cameras: Cameras)
 @pytest.mark.parametrize("engine", ["plain", "fast"])
 @pytest.mark.parametrize("rates", [{"eps": 1e-18}, {"beta2": 0.9}, {"beta2": 0.999999}])
 def test_the_extremes_that_adam_is_allowed_stay_finite(
-    images: ImageData, cameras: Cameras, engine: str, rates: dict[str, float]
+    images: ImageData, cameras: Cameras, engine: str, rates: dict[str, Any]
 ) -> None:
     config: TrainConfig = tiny_config(max_steps=12, rays_per_step=32, engine=engine)
     config = replace(config, optimizer=replace(config.optimizer, **rates))

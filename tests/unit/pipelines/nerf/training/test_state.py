@@ -110,7 +110,7 @@ def test_a_loss_scale_is_taken_over_and_the_rules_of_its_growth_are_not() -> Non
     optimizer = torch.optim.SGD([parameter], lr=0.1)
     for scaler, steps in ((growing, 4), (never, 0)):
         for _ in range(steps):
-            scaler.scale(parameter.sum()).backward()  # type: ignore[no-untyped-call]
+            scaler.scale(parameter.sum()).backward()
             scaler.step(optimizer)
             scaler.update()
     assert growing.get_scale() == 2.0**12

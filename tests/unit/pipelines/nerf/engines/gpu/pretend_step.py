@@ -65,7 +65,7 @@ class Backend:
         return 1
 
 
-class OnlyDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
+class OnlyDevice(TorchDispatchMode):
     """Refuses operations on tensors of the CPU, and indices that are masks, which are counted."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -161,7 +161,7 @@ def run_step(config: TrainConfig, kind: Kind, lens_name: str, *, masked: bool, b
             depth=DepthSupervision(maps, config.depth, config.max_steps) if block == 1 else None,
         )
         exponent: Any = torch.full((), 0.5, device=DEVICE) if kind.annealing else 1.0
-        with OnlyDevice():  # type: ignore[no-untyped-call]
+        with OnlyDevice():
             step.optimise(kind, StepPlan(12, exponent, update_proposals=kind.update_proposals))
         assert ("depth" in step._names[kind]) == (block == 1)
         learned = {name for name, value in model.named_parameters() if value.grad is not None}
@@ -200,7 +200,7 @@ def main() -> None:
             values, host = torch.ones(4, device=DEVICE), torch.zeros(())
             for name, attempt in broken(values, host).items():
                 try:
-                    with OnlyDevice():  # type: ignore[no-untyped-call]
+                    with OnlyDevice():
                         attempt()
                 except (AssertionError, *FAKE_ERRORS) as error:
                     print(f"{name}: {type(error).__name__}")

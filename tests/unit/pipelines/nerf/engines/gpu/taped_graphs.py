@@ -67,11 +67,11 @@ class Tape:
             values.fill_(math.nan if values.is_floating_point() else SPOILED_INTEGER)
 
 
-class _Recording(TorchDispatchMode):  # type: ignore[no-untyped-call]
+class _Recording(TorchDispatchMode):
     """Notes operations, and what must be put back when they have been noted."""
 
     def __init__(self, tape: Tape) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
+        super().__init__()
         self._tape = tape
         self._before: dict[int, tuple[Tensor, Tensor]] = {}
         self._random: dict[int, tuple[torch.Generator, Tensor]] = {}
@@ -124,7 +124,7 @@ class TapedGraphs:
 
     def record(self, work: Callable[[], None]) -> Tape:
         tape = Tape(self)
-        with _Recording(tape) as recording:  # type: ignore[no-untyped-call]
+        with _Recording(tape) as recording:
             work()
         recording.undo()
         self.tapes.append(tape)

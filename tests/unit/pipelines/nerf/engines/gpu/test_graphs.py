@@ -25,6 +25,7 @@ from pipelines.nerf.engines.gpu.step import (
     loss_scale,
 )
 from pipelines.nerf.models.base import Model
+from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.options.catalogue import find_method
 from pipelines.nerf.options.train import TrainConfig
 from tests.unit.pipelines.nerf.engines.gpu.taped_graphs import TapedGraphs
@@ -225,7 +226,8 @@ def test_recording_does_nothing_and_keeps_the_numbers_of_python() -> None:
 
 def test_what_is_new_is_told_before_it_begins() -> None:
     told: list[tuple[int, list[int]]] = []
-    one = toy(taped=True, before_new=lambda: told.append((current, _state(one.pixel_random))))
+    current: int
+    one: Toy = toy(taped=True, before_new=lambda: told.append((current, _state(one.pixel_random))))
     for current in range(FIRST_STEP, FIRST_STEP + 2 * EAGER_STEPS + 4):
         state = _state(one.pixel_random)
         one.run(current, 1)
@@ -244,7 +246,9 @@ def test_a_gradient_that_overflows_skips_the_step_and_halves_the_scale(taped: bo
     largest = loss_scale(32)
     one = toy(taped=taped, scaler=scaler(largest))
     factor = torch.ones(())
-    layer = one.model.field.color_mlp.layers[0]  # type: ignore[union-attr]
+    assert isinstance(one.model, Nerfacto)
+    layer = one.model.field.color_mlp.layers[0]
+    assert isinstance(layer, torch.nn.Linear)
     layer.weight.register_hook(lambda gradient: gradient * factor)
     assert one.run(num=2 * EAGER_STEPS + 2)[-1].scale == largest
     networks = list(one.model.network_parameters())

@@ -65,7 +65,7 @@ def test_a_wrong_gradient_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def spoil(model: Nerfacto) -> None:
         parameters = dict(model.named_parameters())
-        parameters["field.color_mlp.layers.0.weight"].register_hook(half_too_much)  # type: ignore[no-untyped-call]
+        parameters["field.color_mlp.layers.0.weight"].register_hook(half_too_much)
 
     spoil_fast(monkeypatch, spoil)
     problem = engine_problem(plain_config(), CPU)

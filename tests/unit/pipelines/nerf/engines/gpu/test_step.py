@@ -172,11 +172,11 @@ ASKING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonze
 """Operations whose result the host has to wait for: item, bool, data-dependent shapes."""
 
 
-class Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
+class Watch(TorchDispatchMode):
     """Notes the operations that would make a host wait for its GPU, with the file that asked."""
 
     def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
+        super().__init__()
         self.found: list[tuple[str, str]] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

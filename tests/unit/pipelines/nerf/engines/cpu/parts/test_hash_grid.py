@@ -18,6 +18,7 @@ from pipelines.nerf.engines.cpu.parts.hash_grid import hash_encode_fast
 from pipelines.nerf.engines.cpu.render.rays import pack_model, render_rays
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.networks.encodings import HashGrid
+from pipelines.nerf.networks.fields import MLP, DensityField, NerfactoField
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, ProposalConfig
 from pipelines.nerf.options.parts import HashGridConfig
 from pipelines.nerf.space.rays import Rays
@@ -104,6 +105,13 @@ def test_layer_equals_linear_and_relu(inputs: int, outputs: int, count: int) -> 
     np.testing.assert_allclose(out[:outputs, :count], expected.clip(0.0), atol=1e-5)
 
 
+def last_layer(mlp: MLP) -> torch.nn.Linear:
+    """The layer of an MLP that has no ReLU behind it."""
+    last = mlp.layers[-1]
+    assert isinstance(last, torch.nn.Linear)
+    return last
+
+
 def random_model(**changes: object) -> Nerfacto:
     """A small model whose densities reach from fog to walls."""
     torch.manual_seed(1)
@@ -120,10 +128,13 @@ def random_model(**changes: object) -> Nerfacto:
         if isinstance(module, HashGrid):
             module.table.data.normal_()
     with torch.no_grad():
-        for mlp in (model.field.density_mlp, *(network.mlp for network in model.proposals)):
-            mlp.layers[-1].weight[0] *= 8.0
-            mlp.layers[-1].bias[0] += 4.0
-        model.field.color_mlp.layers[-1].weight *= 8.0
+        for network in (model.field, *model.proposals):
+            assert isinstance(network, NerfactoField | DensityField)
+            mlp = network.density_mlp if isinstance(network, NerfactoField) else network.mlp
+            last = last_layer(mlp)
+            last.weight[0] *= 8.0
+            last.bias[0] += 4.0
+        last_layer(model.field.color_mlp).weight.mul_(8.0)
     return model
 
 

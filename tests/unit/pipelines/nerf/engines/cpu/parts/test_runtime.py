@@ -10,16 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipelines import nerf
 from pipelines.nerf.engines.cpu.parts import runtime
 
 
-def _half(values):
+def _half(values: NDArray[np.floating]) -> NDArray[np.floating]:
     return values / 2
 
 
-def _double_half(share, shares, values, out):
+def _double_half(
+    share: int, shares: int, values: NDArray[np.floating], out: NDArray[np.floating]
+) -> None:
     for index in range(share, len(values), shares):
         out[index] = _compiled_half(values[index])
 

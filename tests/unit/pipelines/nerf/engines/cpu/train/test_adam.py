@@ -83,9 +83,9 @@ def test_a_step_leaves_zeros_in_the_same_memory(eps: float) -> None:
 def test_zero_grad_clears_what_came_after_the_step() -> None:
     parameter = nn.Parameter(torch.randn(10))
     optimizer = FusedAdam([parameter], lr=RATE)
-    parameter.square().sum().backward()  # type: ignore[no-untyped-call]
+    parameter.square().sum().backward()
     optimizer.step()
-    parameter.square().sum().backward()  # type: ignore[no-untyped-call]
+    parameter.square().sum().backward()
     assert parameter.grad is not None
     assert parameter.grad.any()
     optimizer.zero_grad()
@@ -105,7 +105,7 @@ def test_parameters_without_a_new_gradient_are_left_out_as_in_torch() -> None:
             if step % 5 == 0:
                 loss = loss + parameters[1].sin().sum()
             optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             optimizer.step()
     for a, b in zip(ours, theirs, strict=True):
         assert (a - b).abs().max() < 1e-6
@@ -169,4 +169,4 @@ def test_a_graph_notices_that_a_step_changed_its_parameters() -> None:
     parameter.grad = torch.ones(3)
     optimizer.step()
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()

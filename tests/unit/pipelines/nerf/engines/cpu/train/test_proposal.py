@@ -187,7 +187,7 @@ def test_in_place_accumulation_adds_to_the_same_memory(threads: int) -> None:
     assert table.grad is not None
     memory = table.grad.data_ptr()
     for _ in range(2):
-        proposal_weights(*rays, network).backward(upstream)  # type: ignore[no-untyped-call]
+        proposal_weights(*rays, network).backward(upstream)
     assert table.grad.data_ptr() == memory
     for parameter, once in zip(network.parameters(), expected, strict=True):
         assert parameter.grad is not None
@@ -200,7 +200,7 @@ def test_parameters_changed_between_forward_and_backward_are_noticed() -> None:
     with torch.no_grad():
         network.grid.table.add_(1.0)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        weights.sum().backward()  # type: ignore[no-untyped-call]
+        weights.sum().backward()
 
 
 def test_second_derivatives_are_refused() -> None:
@@ -210,7 +210,7 @@ def test_second_derivatives_are_refused() -> None:
     assert isinstance(bias, Tensor)
     (slope,) = torch.autograd.grad(weights.square().sum(), bias, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
-        slope.sum().backward()  # type: ignore[no-untyped-call]
+        slope.sum().backward()
 
 
 @pytest.mark.parametrize("num_features", [1, 4])
@@ -241,7 +241,7 @@ def test_training_with_all_parts_follows_the_plain_run(threads: int) -> None:
             if step % 3 != 2:
                 weights = proposal_weights(*rays, network) if fast else plain_weights(rays, network)
                 loss = (weights - target).square().sum()
-                loss.backward()  # type: ignore[no-untyped-call]
+                loss.backward()
                 found.append(loss.item())
             optimizer.step()
         return found
