@@ -95,7 +95,8 @@ def write_posed(
     if turned is not None:
         axis, rotation = turned
         poses = rotation @ poses
-        notes |= {"up": axis, "turned_by": rotation.tolist()}
+        before = np.array(notes.get("applied_transform", np.eye(3, 4).tolist()), np.float64)
+        notes |= {"up": axis, "applied_transform": (rotation @ before).tolist()}
         warnings.append(f"In the pictures {axis} of the file's world is up, not +Z: it was turned.")
     images = tuple(
         PosedImage(

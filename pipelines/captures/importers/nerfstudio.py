@@ -3,9 +3,9 @@
 Keys: `pipelines.captures.transforms_json`; at the top also applied_transform, applied_scale.
 
 The file's world is kept as it is and taken as +Z up, unless the pictures clearly say that another
-of its axes is: +Z is nerfstudio's own convention, and what `applied_transform` has led to; both it
-and `applied_scale` are written down in the notes, as is a turn. Nothing says that its unit is the
-metre, also where there is depth.
+of its axes is, and `orientation_override` does not forbid a turn: +Z is nerfstudio's own
+convention, and what `applied_transform` has led to. That, a turn in it, and `applied_scale` are
+written down in the notes. Nothing says that its unit is the metre, also where there is depth.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from pipelines.captures.transforms_json import Values, read_frames, read_transfo
 from pipelines.captures.unpack import CaptureArchive
 
 _FILE = "transforms.json"
+_ORIENTATION = "orientation_override"
+"""Of nerfstudio: how to turn the world; "none" says that it is upright as it is."""
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 
@@ -43,7 +45,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         sources=listed.sources,
         failures=listed.failures,
         metric=False,
-        up_assumed=True,
+        up_assumed=top.get(_ORIENTATION) != "none",
         notes=_notes(top),
         details={
             "num_listed": len(frames),
@@ -66,8 +68,8 @@ def _unread(archive: CaptureArchive, root: str, top: Values) -> list[str]:
         warnings.append(
             f"{_FILE} says which pictures to hold out; training chooses them by its own rule."
         )
-    if "orientation_override" in top:
-        warnings.append(f"{_FILE} has orientation_override; its world is taken as it is, +Z up.")
+    if top.get(_ORIENTATION, "none") != "none":
+        warnings.append(f"{_FILE} has {_ORIENTATION}; only its value none is heeded.")
     return warnings
 
 

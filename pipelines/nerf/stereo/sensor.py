@@ -25,6 +25,7 @@ _MIN_AGREEING = 1
 _MIN_SHARED = 1000
 _MOST_SPREAD = 0.05
 _SAME_SCALE = 0.01
+_SAME_SURFACE = 0.05
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,13 @@ def sensor_maps(
 
 
 def merged(stereo: DepthMap, sensor: DepthMap) -> DepthMap:
-    """Stereo's depths, which neighbours agreed on; the sensor's where stereo knows nothing."""
-    by_stereo = stereo.z > 0
+    """Stereo's depths where the sensor says about the same or nothing, else the sensor's.
+
+    Stereo is the finer one, and it is the one that errs by much: on reflections and plain surfaces.
+    """
+    both = (stereo.z > 0) & (sensor.z > 0)
+    far_off = both & (np.abs(stereo.z - sensor.z) > _SAME_SURFACE * sensor.z)
+    by_stereo = (stereo.z > 0) & ~far_off
     return DepthMap(
         np.where(by_stereo, stereo.z, sensor.z),
         np.where(by_stereo, stereo.votes, sensor.votes),
