@@ -12,7 +12,7 @@ import pipelines.exports.kinds
 from pipelines.exports.catalogue import EXPORTS, KINDS, get_export
 from pipelines.exports.export import Export
 from pipelines.options import STAGE_OPTIONS
-from pipelines.registry import STAGES, get_stage
+from pipelines.registry import STAGE_NAMES, STAGES, get_stage
 
 HEAVY = ("torch", "numpy", "open3d", "pycolmap", "PIL")
 
