@@ -311,7 +311,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
             ),
             Preset(
                 "detailed",
-                "Half an hour on a laptop: more pictures, more steps, finer surfaces.",
+                "20 to 30 minutes on a laptop: more pictures, more steps, finer surfaces.",
                 {
                     "frames": {"num_frames": 120, "long_side_px": 1280},
                     "poses": {"max_image_px": 1280, "num_features": 6144},

@@ -83,10 +83,13 @@ def texture_from_photos(
     charts = cut(mesh.faces, choice, lambda index, which: photos.pixels(index, vertices[which])[0])
     layout = lay_out(charts, photos.size, largest_side)
     on_progress(_CUT_SHARE)
+    # Smaller copies of the texture mix in what lies beside a patch: nothing there is dark.
+    ground = np.rint(255.0 * np.clip(mesh.colors.mean(axis=0), 0.0, 1.0)).astype(np.uint8)
     picture, colors = _copied(
         charts,
         layout,
         photos,
+        ground,
         lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
     )
     added = levels(charts, colors)
@@ -104,10 +107,17 @@ def texture_from_photos(
 
 
 def _copied(
-    charts: Charts, layout: Layout, photos: Photos, on_progress: Callable[[float], None]
+    charts: Charts,
+    layout: Layout,
+    photos: Photos,
+    ground: Bytes,
+    on_progress: Callable[[float], None],
 ) -> tuple[Bytes, Floats]:
-    """The patches in their places, and each corner's colour in its photo, [U, 3]."""
-    picture = np.zeros((layout.side, layout.side, 3), np.uint8)
+    """The patches in their places, and each corner's colour in its photo, [U, 3].
+
+    ground: [3], what is where no patch is.
+    """
+    picture = np.broadcast_to(ground, (layout.side, layout.side, 3)).copy()
     colors = np.full((len(charts.vertex), 3), np.nan)
     by_photo = charts.photo[layout.charts]
     used = np.unique(by_photo)

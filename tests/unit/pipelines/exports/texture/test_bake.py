@@ -103,6 +103,15 @@ def test_a_masked_part_of_the_photos_colours_nothing(tmp_path: Path) -> None:
     assert np.abs(found[hidden] - 0.5).max() < 0.01
 
 
+def test_where_nothing_lies_the_picture_is_no_darker_than_the_mesh(tmp_path: Path) -> None:
+    """Viewers mix it in from afar: black there would be specks."""
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    )
+    picture = texture_from_photos(painted_ball.ball(), photos, 1024).texture
+    assert (picture[-1, -1] == 128).all(), "the mean of the vertices, which are grey"
+
+
 def test_a_picture_too_small_is_filled_with_less_detail(tmp_path: Path) -> None:
     photos = painted_ball.photos_of(
         tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
