@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import open3d
-import torch
 from numpy.typing import NDArray
 
 from pipelines.nerf.space.cameras import Cameras
+from pipelines.scene.picture_sampling import between_pixels, points_in_frame
 
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -27,7 +27,6 @@ WIDEST_SPACING = 3.0
 """A lone point's spacing is at most so many medians, or it would hide half a picture."""
 MAX_RADIUS_PX = 6
 """A point is drawn at most this large: what is right before the camera must not hide the rest."""
-_MAX_ANGLE_ERROR = 0.02
 _TEXTURE_LEVELS = 4
 """Farther copies would mix in what lies beside a patch."""
 
@@ -85,7 +84,8 @@ class Texture:
         for index, picture in enumerate(self._levels):
             mine = level == index
             if mine.any():
-                found[mine] = _between_pixels(picture, uv[mine])
+                height, width = picture.shape[:2]
+                found[mine] = between_pixels(picture, uv[mine, 0] * width, uv[mine, 1] * height)
         return found
 
 
@@ -94,19 +94,6 @@ def _twice_area(corners: Floats) -> Floats:
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area: Floats = np.linalg.norm(across, axis=1)
     return area
-
-
-def _between_pixels(picture: NDArray[np.float32], uv: Floats) -> Floats:
-    """Bilinear interpolation of [H, W, 3] at places in [0, 1], [N, 2]."""
-    height, width = picture.shape[:2]
-    u = np.clip(uv[:, 0] * width - 0.5, 0.0, width - 1.0)
-    v = np.clip(uv[:, 1] * height - 0.5, 0.0, height - 1.0)
-    i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
-    fu, fv = (u - i)[:, None], (v - j)[:, None]
-    top = picture[j, i] * (1.0 - fu) + picture[j, i + 1] * fu
-    bottom = picture[j + 1, i] * (1.0 - fu) + picture[j + 1, i + 1] * fu
-    between: Floats = top * (1.0 - fv) + bottom * fv
-    return between
 
 
 class MeshCaster:
@@ -197,7 +184,9 @@ def cloud_view(
     pixel and at most `MAX_RADIUS_PX`.
     """
     width, height = cameras.size[index].tolist()
-    pixels, z_depth, distance, which = _in_frame(points, cameras, index)
+    which, pixels, z_depth = points_in_frame(points, cameras, index)
+    eye = cameras.scene_from_camera[index, :, 3].numpy()
+    distance = np.linalg.norm(np.asarray(points, np.float32)[which] - eye, axis=1)
     focal = float(cameras.focal[index].mean())
     sides = np.clip(focal * radius[which] / np.maximum(z_depth, 1e-9), 0.5, MAX_RADIUS_PX)
     first = np.floor(pixels).astype(np.int64)
@@ -226,28 +215,3 @@ def cloud_view(
     color = np.zeros((height, width, 3), np.float32)
     color[hit] = colors[owner[hit]]
     return AssetView(color, hit, nearest)
-
-
-def _in_frame(
-    points: Floats, cameras: Cameras, index: int
-) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
-    """Of the points that the camera has in its frame: pixels [Q, 2], z-depth, distance, indices."""
-    places = torch.as_tensor(np.ascontiguousarray(points, np.float32))
-    rows = torch.full((len(places),), index, dtype=torch.int64)
-    pixels, z_depth = cameras.project(places, rows)
-    inside = ((pixels >= 0.0) & (pixels < cameras.size[index])).all(dim=-1)
-    which = torch.nonzero(inside).squeeze(-1)
-    toward = places[which] - cameras.scene_from_camera[index, :, 3]
-    distance = toward.norm(dim=-1)
-    # A point behind the camera, or beyond where the lens formula folds back, has a pixel too: one
-    # whose ray leads elsewhere.
-    ways = cameras.generate_rays(rows[which], pixels[which]).directions
-    error = (ways - toward / distance.clamp_min(1e-12)[:, None]).norm(dim=-1)
-    true = error < _MAX_ANGLE_ERROR
-    which = which[true]
-    return (
-        pixels[which].numpy(),
-        z_depth[which].numpy(),
-        distance[true].numpy(),
-        which.numpy(),
-    )

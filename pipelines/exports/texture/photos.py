@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
 from pipelines.nerf.space.cameras import SceneTransform
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.scene.picture_sampling import between_pixels, points_in_frame
 from pipelines.scene.trained_scene import nerf_cameras
 
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
-_MAX_ANGLE_ERROR = 0.005
+_MARGIN_PX = 1.0
 _GLANCE_SIDE = 640
 _SMALL_SIDE = 320
 _BLUR_PX = 1.5
@@ -55,21 +55,11 @@ class Photos:
         return eye
 
     def pixels(self, index: int, points: Floats) -> tuple[NDArray[np.float64], Bools]:
-        """Where points [P, 3] appear: pixels [P, 2], and whether that is within the photo [P]."""
-        places = torch.as_tensor(np.ascontiguousarray(points, np.float32))
-        rows = torch.full((len(places),), index, dtype=torch.int64)
-        pixels, _ = self._cameras.project(places, rows)
-        inside = ((pixels >= 1.0) & (pixels <= self._cameras.size[index] - 1.0)).all(dim=-1)
-        which = torch.nonzero(inside).squeeze(-1)
-        # A point behind the camera, or beyond where the lens formula folds back, has a pixel too:
-        # one whose ray leads elsewhere.
-        ways = self._cameras.generate_rays(rows[which], pixels[which]).directions
-        toward = places[which] - self._cameras.scene_from_camera[index, :, 3]
-        toward = torch.nn.functional.normalize(toward, dim=-1)
-        true = (ways - toward).norm(dim=-1) < _MAX_ANGLE_ERROR
-        shown = np.zeros(len(points), np.bool_)
-        shown[which[true].numpy()] = True
-        return pixels.numpy().astype(np.float64), shown
+        """Where points [P, 3] appear: pixels [P, 2], 0 beyond the photo, and whether in it [P]."""
+        which, found, _ = points_in_frame(points, self._cameras, index, _MARGIN_PX)
+        pixels, shown = np.zeros((len(points), 2)), np.zeros(len(points), np.bool_)
+        pixels[which], shown[which] = found, True
+        return pixels, shown
 
     def load(self, index: int) -> Image.Image:
         """The photo, RGB."""
@@ -106,15 +96,7 @@ def softened(photo: Image.Image) -> Image.Image:
 def colors_at(photo: Image.Image, pixels: Floats) -> NDArray[np.float32]:
     """Colours [P, 3] in [0, 1] at pixels [P, 2], between pixels by bilinear interpolation."""
     picture = np.asarray(photo, np.float32) / np.float32(255.0)
-    height, width = picture.shape[:2]
-    u = np.clip(pixels[:, 0] - 0.5, 0.0, width - 1.0)
-    v = np.clip(pixels[:, 1] - 0.5, 0.0, height - 1.0)
-    i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
-    fu, fv = (u - i)[:, None], (v - j)[:, None]
-    top = picture[j, i] * (1.0 - fu) + picture[j, i + 1] * fu
-    bottom = picture[j + 1, i] * (1.0 - fu) + picture[j + 1, i + 1] * fu
-    found: NDArray[np.float32] = (top * (1.0 - fv) + bottom * fv).astype(np.float32)
-    return found
+    return between_pixels(picture, pixels[:, 0], pixels[:, 1])
 
 
 def sharpness(photo: Image.Image) -> float:
