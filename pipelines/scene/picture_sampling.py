@@ -12,9 +12,6 @@ from pipelines.nerf.space.cameras import Cameras
 
 Floats = NDArray[np.floating[Any]]
 
-MAX_ANGLE_ERROR = 0.005
-"""Between the way to a point and the ray of its pixel, as a chord of the unit sphere."""
-
 
 def between_pixels(picture: NDArray[np.float32], u: Floats, v: Floats) -> NDArray[np.float32]:
     """Bilinear interpolation of [H, W, C] at columns u [N] and rows v [N], [N, C].
@@ -39,14 +36,5 @@ def points_in_frame(
     Returns which [Q], their pixels [Q, 2] and their z-depth [Q]. margin_px: of the frame, left out.
     """
     places = torch.as_tensor(np.ascontiguousarray(points, np.float32))
-    rows = torch.full((len(places),), index, dtype=torch.int64)
-    pixels, z_depth = cameras.project(places, rows)
-    inside = (pixels >= margin_px) & (pixels < cameras.size[index] - margin_px)
-    which = torch.nonzero(inside.all(dim=-1)).squeeze(-1)
-    # A point behind the camera, or beyond where the lens formula folds back, has a pixel too: one
-    # whose ray leads elsewhere.
-    ways = cameras.generate_rays(rows[which], pixels[which]).directions
-    toward = places[which] - cameras.scene_from_camera[index, :, 3]
-    toward = torch.nn.functional.normalize(toward, dim=-1)
-    which = which[(ways - toward).norm(dim=-1) < MAX_ANGLE_ERROR]
-    return which.numpy(), pixels[which].numpy(), z_depth[which].numpy()
+    which, pixels, z_depth = cameras.points_in_frame(places, index, margin_px)
+    return which.numpy(), pixels.numpy(), z_depth.numpy()

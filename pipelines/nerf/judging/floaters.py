@@ -35,7 +35,6 @@ MAX_NEAR_CAMERAS = 64
 
 # 1 / p and 1 / p^2 with p^3 = p + 1: their multiples fill the unit square evenly (Roberts, 2018).
 _SHIFTS = (0.7548776662466927, 0.5698402909980532)
-_MAX_ANGLE_ERROR = 0.02
 
 
 class DepthPicture(Protocol):
@@ -242,14 +241,7 @@ def _before_surface(
 
 
 def _in_frame(cameras: Cameras, index: int, points: Tensor) -> Tensor:
-    """Which points [P, 3] a camera would show if nothing stood before them."""
-    rows = torch.full((len(points),), index, dtype=torch.int64, device=points.device)
-    pixels, _ = cameras.project(points, rows)
-    inside = (pixels >= 0.0).all(dim=-1) & (pixels < cameras.size[index]).all(dim=-1)
-    # A point behind a camera, or beyond where its lens formula folds back, has a pixel too: one
-    # whose ray leads elsewhere.
-    toward = points - cameras.scene_from_camera[index, :, 3]
-    found = torch.where(inside[:, None], pixels, torch.zeros_like(pixels))
-    ways = cameras.generate_rays(rows, found).directions
-    error = (ways - torch.nn.functional.normalize(toward, dim=-1)).norm(dim=-1)
-    return torch.logical_and(inside, error < _MAX_ANGLE_ERROR)
+    """Which points [P, 3] a camera would show if nothing stood before them: [P] bool."""
+    shown = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    shown[cameras.points_in_frame(points, index)[0]] = True
+    return shown

@@ -33,6 +33,8 @@ from pipelines.nerf.space.lenses import (
 )
 from pipelines.nerf.space.rays import Rays
 
+MAX_ANGLE_ERROR = 0.005
+"""Between the way to a point and the ray of its pixel, as a chord of the unit sphere."""
 MAX_SKEW = 1e-3
 """Largest departure of R R^T from the identity that still counts as rounding."""
 MAX_PANORAMA = 1.01
@@ -250,6 +252,26 @@ class Cameras:
         terms, model = self.distortion[camera_indices], self.model[camera_indices]
         plane = distort(local, terms, model, self.kinds)
         return plane * self.focal[camera_indices] + self.principal[camera_indices], local[:, 2]
+
+    def points_in_frame(
+        self, points: Tensor, index: int, margin_px: float = 0.0
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of points [P, 3] those that camera `index` has in its frame, hidden or not.
+
+        Returns which [Q] int64, their pixels [Q, 2] and z-depths [Q]. margin_px: of the frame, left
+        out.
+        """
+        rows = torch.full((len(points),), index, dtype=torch.int64, device=points.device)
+        pixels, z_depth = self.project(points, rows)
+        inside = (pixels >= margin_px) & (pixels < self.size[index] - margin_px)
+        which = torch.nonzero(inside.all(dim=-1)).squeeze(-1)
+        # A point behind the camera, or beyond where the lens formula folds back, has a pixel too:
+        # one whose ray leads elsewhere.
+        ways = self.generate_rays(rows[which], pixels[which]).directions
+        toward = points[which] - self.scene_from_camera[index, :, 3]
+        error = (ways - torch.nn.functional.normalize(toward, dim=-1)).norm(dim=-1)
+        which = which[error < MAX_ANGLE_ERROR]
+        return which, pixels[which], z_depth[which]
 
     def _directions(self, camera_indices: Tensor, pixels: Tensor) -> Tensor:
         """Unit directions [R, 3] in scene space."""
