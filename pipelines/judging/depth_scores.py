@@ -1,4 +1,4 @@
-"""How far a surface is from where it should be: depth maps compared, and read from files.
+"""How far a surface is from where it should be: depth maps compared.
 
 All depths are z-depth, [H, W], 0 or not finite where nothing is known. `relative error` is
 |asset - truth| / truth.
@@ -7,12 +7,10 @@ All depths are z-depth, [H, W], 0 or not finite where nothing is known. `relativ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 Floats = NDArray[np.floating[Any]]
 
@@ -91,23 +89,6 @@ def fitted_scale(asset: Sequence[Floats], truth: Sequence[Floats]) -> float | No
         ratios.append(true[both] / found[both])
     every = np.concatenate(ratios)
     return float(np.median(every)) if len(every) else None
-
-
-def read_depth_png(path: Path, unit: float, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """A 16-bit one-channel PNG as z-depth [H, W] in world units, brought to `shape`, 0 for unknown.
-
-    unit: world units per stored value, nerfstudio's `depth_unit_scale_factor`; 0.001 for
-    millimetres. Each pixel takes the nearest stored value, as a mean across an edge lies on neither
-    surface. Raises ValueError for what is no such picture.
-    """
-    try:
-        with Image.open(path) as opened:
-            mode, stored = opened.mode, np.asarray(opened)
-    except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path.name} is no depth picture: {error}") from error
-    if stored.ndim != 2 or mode == "L":
-        raise ValueError(f"{path.name} is no 16-bit one-channel depth picture, but {mode}")
-    return (nearest(stored, shape).astype(np.float64) * unit).astype(np.float32)
 
 
 def nearest(stored: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:

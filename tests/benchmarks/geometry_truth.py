@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from pipelines.captures.record import CaptureRecord
 from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.judging.asset_views import MeshCaster
-from pipelines.judging.depth_scores import depth_scores, read_depth_png
+from pipelines.judging.depth_scores import depth_scores, nearest
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.sample.align import Floats
@@ -151,3 +151,20 @@ def _depth_of(
 def _photo(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
     with Image.open(path) as opened:
         return np.asarray(opened.convert("RGB").resize((shape[1], shape[0])))
+
+
+def read_depth_png(path: Path, unit: float, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """A 16-bit one-channel PNG as z-depth [H, W] in world units, brought to `shape`, 0 for unknown.
+
+    unit: world units per stored value, nerfstudio's `depth_unit_scale_factor`; 0.001 for
+    millimetres. Each pixel takes the nearest stored value, as a mean across an edge lies on neither
+    surface. Raises ValueError for what is no such picture.
+    """
+    try:
+        with Image.open(path) as opened:
+            mode, stored = opened.mode, np.asarray(opened)
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"{path.name} is no depth picture: {error}") from error
+    if stored.ndim != 2 or mode == "L":
+        raise ValueError(f"{path.name} is no 16-bit one-channel depth picture, but {mode}")
+    return (nearest(stored, shape).astype(np.float64) * unit).astype(np.float32)

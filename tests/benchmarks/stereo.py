@@ -19,13 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.judging.depth_scores import read_depth_png
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.maps import find_depth_maps
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.stereo_views import stereo_view
-from tests.benchmarks.geometry_truth import depth_files
+from tests.benchmarks.geometry_truth import depth_files, read_depth_png
 from tests.benchmarks.tables import markdown_table, number
 
 EVERY = 10

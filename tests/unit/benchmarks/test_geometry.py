@@ -23,6 +23,7 @@ from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
 from tests.benchmarks import geometry
 from tests.benchmarks.geometry_pictures import depth_picture, error_picture
+from tests.benchmarks.geometry_truth import read_depth_png
 from tests.benchmarks.scene_capture import scene_capture
 from tests.benchmarks.turntable import turntable
 
@@ -186,3 +187,26 @@ def test_errors_are_red_before_blue_behind_and_black_where_nothing_is() -> None:
     assert near == [253, 231, 37]
     assert far == [68, 1, 84]
     assert nothing == [0, 0, 0]
+
+
+def test_millimetres_are_read_at_another_size_without_mixing_depths(tmp_path: Path) -> None:
+    stored = np.full((20, 30), 1500, np.uint16)
+    stored[:, 15:] = 4000
+    stored[:5] = 0
+    Image.fromarray(stored).save(tmp_path / "depth.png")
+    depth = read_depth_png(tmp_path / "depth.png", 0.001, (10, 15))
+    assert sorted(np.unique(depth).tolist()) == pytest.approx([0.0, 1.5, 4.0])
+    assert depth[9, 0] == pytest.approx(1.5)
+    assert (depth[:2] == 0).all()
+    larger = read_depth_png(tmp_path / "depth.png", 0.001, (40, 60))
+    assert larger.shape == (40, 60)
+    assert larger[39, 59] == pytest.approx(4.0)
+
+
+def test_what_is_no_depth_picture_is_refused(tmp_path: Path) -> None:
+    Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "grey.png")
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "rgb.png")
+    (tmp_path / "text.png").write_text("no picture")
+    for name in ("grey.png", "rgb.png", "text.png", "absent.png"):
+        with pytest.raises(ValueError, match=name):
+            read_depth_png(tmp_path / name, 0.001, (4, 4))

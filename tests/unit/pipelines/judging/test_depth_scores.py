@@ -1,18 +1,14 @@
-"""Depth against truth: shares as made, holes on either side, files as cameras write them."""
+"""Depth against truth: shares as made, holes on either side."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from PIL import Image
 
 from pipelines.judging.depth_scores import (
     depth_agreement,
     depth_scores,
     fitted_scale,
-    read_depth_png,
 )
 
 
@@ -73,26 +69,3 @@ def test_a_scale_is_found_through_holes_and_outliers() -> None:
     found, truth = _maps()
     assert fitted_scale([found], [3 * truth]) == pytest.approx(3 / 1.01)
     assert fitted_scale([0 * found], [truth]) is None
-
-
-def test_millimetres_are_read_at_another_size_without_mixing_depths(tmp_path: Path) -> None:
-    stored = np.full((20, 30), 1500, np.uint16)
-    stored[:, 15:] = 4000
-    stored[:5] = 0
-    Image.fromarray(stored).save(tmp_path / "depth.png")
-    depth = read_depth_png(tmp_path / "depth.png", 0.001, (10, 15))
-    assert sorted(np.unique(depth).tolist()) == pytest.approx([0.0, 1.5, 4.0])
-    assert depth[9, 0] == pytest.approx(1.5)
-    assert (depth[:2] == 0).all()
-    larger = read_depth_png(tmp_path / "depth.png", 0.001, (40, 60))
-    assert larger.shape == (40, 60)
-    assert larger[39, 59] == pytest.approx(4.0)
-
-
-def test_what_is_no_depth_picture_is_refused(tmp_path: Path) -> None:
-    Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "grey.png")
-    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "rgb.png")
-    (tmp_path / "text.png").write_text("no picture")
-    for name in ("grey.png", "rgb.png", "text.png", "absent.png"):
-        with pytest.raises(ValueError, match=name):
-            read_depth_png(tmp_path / name, 0.001, (4, 4))

@@ -320,3 +320,27 @@ def test_unusable_cameras_are_refused(change: dict[str, object], problem: str) -
     }
     with pytest.raises(NerfError, match=problem):
         Cameras.from_arrays(**{**values, **change})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.1])
+def test_a_frame_holds_what_its_rays_meet_and_nothing_from_behind(k1: float) -> None:
+    """Also no point that a folding lens formula puts there from far aside."""
+    cameras = Cameras.from_arrays(
+        world_from_camera=np.eye(4)[None, :3],
+        scene=SceneTransform((0.0, 0.0, 0.0), 1.0),
+        widths=[80],
+        heights=[60],
+        focal=[(50.0, 50.0)],
+        principal=[(40.0, 30.0)],
+        models=["OPENCV"],
+        distortion=[(k1, 0.0, 0.0, 0.0, 0.0, 0.0)],
+    )
+    rays = cameras.image_rays(0)
+    met = rays.origins + 3.0 * rays.directions
+    behind, aside = -met, torch.tensor([[9.0, 0.2, -3.0], [5.2, 0.0, -3.0]])
+    which, pixels, z_depth = cameras.points_in_frame(torch.cat([met, behind, aside]), 0)
+    assert which.tolist() == list(range(80 * 60))
+    assert torch.allclose(z_depth, -met[:, 2], atol=1e-4)
+    assert torch.allclose(pixels[:2], torch.tensor([[0.5, 0.5], [1.5, 0.5]]), atol=1e-2)
+    inner, _, _ = cameras.points_in_frame(met, 0, margin_px=5.0)
+    assert len(inner) == 70 * 50
