@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from api.client import (
+from api.client.client import (
     ApiProblem,
     Artifact,
     Capture,
@@ -34,11 +34,17 @@ __all__ = [
 ]
 
 
+def _up(arguments: list[str]) -> int:
+    from deploy import local
+
+    return local.main(arguments)
+
+
 def main() -> int:
     """The `nerfworks` command."""
-    from api.cli import main as run
+    from api.client.cli import main as run
 
-    return run()
+    return run(up=_up)
 
 
 if __name__ == "__main__":

@@ -19,11 +19,11 @@ from types import FrameType
 
 from rich.console import Console
 
-from api.cli_display import print_error, print_results, transfer_bar, watch_job
-from api.client import Client, NerfworksError
+from api.client.client import Client, NerfworksError
+from api.client.display import print_error, print_results, transfer_bar, watch_job
 from deploy.embedded import Embedded, default_home, free_port
 from deploy.supervisor import StartFailed
-from pipelines.options import OptionsError, parse_assignments
+from pipelines.assignments import AssignmentError, parse_assignments
 
 
 class Stopped(Exception):
@@ -93,7 +93,7 @@ def main() -> int:
     except (KeyboardInterrupt, Stopped):
         console.print("Stopped: nothing is left running.")
         return 130
-    except (StartFailed, NerfworksError, OptionsError, subprocess.CalledProcessError) as error:
+    except (StartFailed, NerfworksError, AssignmentError, subprocess.CalledProcessError) as error:
         console.print(f"[red]The demo failed.[/red] {error}", highlight=False)
         return 1
     finally:

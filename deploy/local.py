@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import fcntl
+import importlib.util
 import json
 import os
 import signal
@@ -33,6 +34,12 @@ def take_lock(home: Path) -> IO[str] | None:
     return lock
 
 
+def missing_parts() -> list[str]:
+    """Libraries of the service that this installation lacks: a caller's has the client alone."""
+    needed = ("fastapi", "sqlalchemy", "celery", "torch", "pycolmap")
+    return [name for name in needed if importlib.util.find_spec(name) is None]
+
+
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The command line; environment variables give the defaults."""
     parser = argparse.ArgumentParser(prog="nerfworks up", description=__doc__)
@@ -45,6 +52,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> int:
     """Run until asked to stop. Returns the process's exit status."""
     options = parse(arguments)
+    if missing := missing_parts():
+        print(
+            f"The service is not installed here: {', '.join(missing)} is missing. "
+            "Install it: pip install 'nerfworks[server,worker]'",
+            file=sys.stderr,
+        )
+        return 1
     home = default_home()
     lock = take_lock(home)
     if lock is None:

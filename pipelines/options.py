@@ -462,27 +462,3 @@ def stage_options(stage: str, values: dict[str, Any]) -> StageOptions:
     if stage == "train":
         return train_options(str(values.get("method", NERFACTO.name))).model_validate(values)
     return STAGE_OPTIONS[stage].model_validate(values)
-
-
-def parse_assignments(assignments: list[str]) -> dict[str, Any]:
-    """`["train.max_steps=500"]` as nested options. Values are JSON where they parse as JSON.
-
-    Raises OptionsError for a text without "=" or without a stage.
-    """
-    import json
-
-    nested: dict[str, Any] = {}
-    for text in assignments:
-        path, equals, raw = text.partition("=")
-        keys = path.strip().split(".")
-        if not equals or len(keys) < 2 or not all(keys):
-            raise OptionsError([(text, "expected stage.option=value")])
-        try:
-            value: Any = json.loads(raw)
-        except json.JSONDecodeError:
-            value = raw
-        level = nested
-        for key in keys[:-1]:
-            level = level.setdefault(key, {})
-        level[keys[-1]] = value
-    return nested

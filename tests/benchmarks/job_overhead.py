@@ -26,10 +26,10 @@ from typing import Any
 
 from rich.console import Console
 
-from api.client import Client
+from api.client.client import Client
 from deploy.demo import sample_capture
 from deploy.embedded import Embedded, default_home, free_port
-from pipelines.options import parse_assignments
+from pipelines.assignments import parse_assignments
 from storage.db import Database
 from storage.queries import get_job
 from tests.benchmarks.machine import describe, heading

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from api.client import Client
+from api.client.client import Client
 from deploy.embedded import Embedded, free_port
 from deploy.supervisor import Supervisor
 from tests.samples import sample_clip

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from api.client import Client
+from api.client.client import Client
 from deploy.embedded import Embedded, free_port
 from tests.capture_writers import write_polycam
 from tests.e2e.waiting import succeeded

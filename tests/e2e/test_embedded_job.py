@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from api.client import Client
+from api.client.client import Client
 from deploy.embedded import Embedded
 from deploy.supervisor import Supervisor
 from pipelines.exports.formats.ply import read_ply

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from sqlalchemy import create_engine, text
 
-from api.client import Client, Job
+from api.client.client import Client, Job
 from deploy.embedded import Embedded
 from deploy.supervisor import Supervisor
 from tests.capture_writers import write_nerfstudio

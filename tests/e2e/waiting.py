@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from api.client import Client, Job, WaitTimedOut
+from api.client.client import Client, Job, WaitTimedOut
 from deploy.embedded import Embedded
 from deploy.supervisor import tail
 

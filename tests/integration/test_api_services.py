@@ -17,8 +17,8 @@ import httpx
 import pytest
 import redis
 
-from api.client import ApiProblem, Client
-from api.client_transfer import Download
+from api.client.client import ApiProblem, Client
+from api.client.transfer import Download
 from storage.queue import QUEUE_CPU
 from tests.services import RedisServer, S3Endpoint, free_port
 from tests.unit.api.conftest import (

@@ -20,7 +20,7 @@ from typing import Any
 
 import httpx
 
-from api.client_models import (
+from api.client.models import (
     ApiProblem,
     Artifact,
     Capture,
@@ -36,8 +36,8 @@ from api.client_models import (
     Stage,
     WaitTimedOut,
 )
-from api.client_transfer import Download, MultipartFile, OnProgress
-from api.client_wire import (
+from api.client.transfer import Download, MultipartFile, OnProgress
+from api.client.wire import (
     BUSY,
     Patience,
     Wire,

@@ -21,7 +21,16 @@ from typing import Any
 
 from rich.console import Console
 
-from api.cli_display import (
+from api.client.client import (
+    RETRY_S,
+    ApiProblem,
+    Client,
+    ConnectionFailed,
+    Job,
+    JobFailed,
+    NerfworksError,
+)
+from api.client.display import (
     clean,
     print_error,
     print_job,
@@ -30,9 +39,7 @@ from api.cli_display import (
     transfer_bar,
     watch_job,
 )
-from api.client import RETRY_S, ApiProblem, Client, ConnectionFailed, Job, JobFailed, NerfworksError
-
-__all__ = ["main", "print_results", "watch_job"]
+from pipelines.assignments import AssignmentError, parse_assignments
 
 OK, FAILED, USAGE, UNREACHABLE = 0, 1, 2, 3
 INTERRUPTED = 130
@@ -43,11 +50,9 @@ class UsageError(Exception):
 
 
 def _options(assignments: list[str]) -> dict[str, Any]:
-    from pipelines.options import OptionsError, parse_assignments
-
     try:
         return parse_assignments(assignments)
-    except OptionsError as error:
+    except AssignmentError as error:
         raise UsageError(f"--set: {error}") from error
 
 
@@ -197,13 +202,7 @@ def presets(client: Client, args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
-def _up(arguments: list[str]) -> int:
-    from deploy import local
-
-    return local.main(arguments)
-
-
-def _parser() -> argparse.ArgumentParser:
+def _parser(with_up: bool) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="nerfworks", description="A phone capture in; a mesh, a point cloud and a video out."
     )
@@ -219,7 +218,8 @@ def _parser() -> argparse.ArgumentParser:
             added.add_argument("job", metavar="JOB")
         return added
 
-    commands.add_parser("up", help="Keep the service running from this folder", add_help=False)
+    if with_up:
+        commands.add_parser("up", help="Keep the service running from this folder", add_help=False)
     one = command("submit", submit)
     one.add_argument("file", metavar="FILE", help="a video, or a .zip of photos or an app export")
     one.add_argument("--preset", help="`nerfworks presets` lists them; else the service chooses")
@@ -253,12 +253,15 @@ def _say(errors: Console, error: NerfworksError) -> None:
         errors.print(clean(error.hint), highlight=False, soft_wrap=True)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command. Returns the process's exit status."""
+def main(arguments: list[str] | None = None, up: Callable[[list[str]], int] | None = None) -> int:
+    """Run the command. Returns the process's exit status.
+
+    up: what starts the service, which is no part of the client.
+    """
     given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["up"]:
-        return _up(given[1:])
-    args = _parser().parse_args(given)
+    if given[:1] == ["up"] and up is not None:
+        return up(given[1:])
+    args = _parser(with_up=up is not None).parse_args(given)
     console, errors = Console(), Console(stderr=True)
     try:
         with Client(args.url, retry_s=RETRY_S) as client:

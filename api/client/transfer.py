@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import httpx
 
-from api.client_models import Artifact, ChecksumMismatch, NerfworksError
+from api.client.models import Artifact, ChecksumMismatch, NerfworksError
 
 CHUNK_BYTES = 1 << 18
 OnProgress = Callable[[int, int], None]

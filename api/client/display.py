@@ -21,7 +21,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from api.client import Artifact, Client, Job, Stage
+from api.client.client import Artifact, Client, Job, Stage
 
 PLAIN_EVERY_S = 15.0
 _STYLES = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}

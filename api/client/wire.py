@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 import httpx
 
-from api.client_models import ApiProblem, ConnectionFailed
+from api.client.models import ApiProblem, ConnectionFailed
 
 POLL_MIN_S, POLL_MAX_S = 0.2, 30.0
 PAUSE_FIRST_S, PAUSE_MOST_S = 0.2, 5.0

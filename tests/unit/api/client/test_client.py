@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from api.client import (
+from api.client.client import (
     ApiProblem,
     ChecksumMismatch,
     Client,
@@ -25,8 +25,8 @@ from api.client import (
     WaitTimedOut,
     find_service,
 )
-from api.client_models import Artifact
-from api.client_transfer import Download, safe_target
+from api.client.models import Artifact
+from api.client.transfer import Download, safe_target
 from storage.jobs import request_cancel
 from tests.services import free_port
 from tests.unit.api.conftest import (
@@ -38,7 +38,7 @@ from tests.unit.api.conftest import (
     zip_of_pictures,
 )
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 CONTENT = bytes(range(256)) * 4096
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
 
