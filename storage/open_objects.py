@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
-from storage.objects import LocalObjectStore, ObjectStore
+from storage.objects import ObjectStore
+from storage.objects_local import LocalObjectStore
 from storage.settings import StorageSettings
 
 

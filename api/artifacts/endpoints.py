@@ -13,7 +13,8 @@ from api.artifacts.schemas import ArtifactList
 from api.deps import ServicesDep
 from api.errors import responses
 from storage import queries
-from storage.objects import LocalObjectStore, verify_object_token
+from storage.objects_local import LocalObjectStore
+from storage.signed_urls import verify_object_token
 
 router = APIRouter(prefix="/v1/jobs/{job_id}/artifacts", tags=["artifacts"])
 signed_router = APIRouter(prefix="/v1/objects", tags=["artifacts"])

@@ -14,7 +14,7 @@ from api.problems import MissingError
 from pipelines.registry import STAGES, get_stage
 from pipelines.stage import REPORT, Artifact
 from storage.models import Job
-from storage.objects import LocalObjectStore
+from storage.objects_local import LocalObjectStore
 
 (_REPORT,) = (found for found in get_stage("report").artifacts if found.path == REPORT)
 _LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})

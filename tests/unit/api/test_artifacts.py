@@ -19,7 +19,7 @@ from pipelines.registry import STAGES
 from storage.jobs import stage_id
 from storage.keys import attempt_prefix
 from storage.leases import FailureReport, claim_stage, fail_stage
-from storage.objects import SignedObject, make_object_token
+from storage.signed_urls import SignedObject, make_object_token
 from tests.unit.api.conftest import Service, finish_job, problem, serving, settings_for
 
 CONTENT = bytes(range(256)) * 40

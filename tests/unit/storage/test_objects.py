@@ -13,15 +13,11 @@ from storage.errors import (
     ObjectStoreError,
     ObjectStoreFullError,
 )
-from storage.objects import (
-    LocalObjectStore,
-    SignedObject,
-    check_key,
-    make_object_token,
-    verify_object_token,
-)
+from storage.objects import check_key
+from storage.objects_local import LocalObjectStore
 from storage.open_objects import open_object_store
 from storage.settings import StorageSettings
+from storage.signed_urls import SignedObject, make_object_token, verify_object_token
 
 KEY = b"signing key"
 

@@ -14,7 +14,7 @@ from storage.errors import ConflictError, InvalidCursorError, NotFoundError
 from storage.jobs import request_cancel, stage_id
 from storage.leases import Claim, claim_stage
 from storage.models import ApiKey, Capture
-from storage.objects import LocalObjectStore
+from storage.objects_local import LocalObjectStore
 from storage.queries import get_job, list_captures, list_jobs, queue_position
 from storage.queue import QUEUE_CPU, QUEUE_GPU, queue_for
 from storage.records import (

@@ -11,7 +11,7 @@ import pytest
 
 from storage.jobs import request_cancel, stage_id
 from storage.leases import cancel_stage, claim_stage
-from storage.objects import LocalObjectStore
+from storage.objects_local import LocalObjectStore
 from storage.queries import WaitingStage
 from storage.queue import Bell
 from tests.factories import make_database, make_job

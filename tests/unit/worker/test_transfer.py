@@ -15,7 +15,8 @@ from storage.errors import ObjectStoreError, ObjectStoreFullError
 from storage.jobs import stage_id
 from storage.leases import Claim, claim_stage
 from storage.models import StageRow
-from storage.objects import LocalObjectStore, OnBytes
+from storage.objects import OnBytes
+from storage.objects_local import LocalObjectStore
 from storage.queries import StageInput, StageWork
 from tests.factories import make_database, make_job
 from worker.checkpoints import CheckpointUploader, Snapshot
