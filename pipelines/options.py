@@ -37,7 +37,7 @@ class IngestOptions(StageOptions):
         600,
         ge=MIN_POSED_IMAGES,
         le=100_000,
-        description="Images used of a Polycam or Record3D export, evenly picked.",
+        description="Images used of a phone app's export, evenly picked.",
     )
     max_pixels: int = Field(
         200_000_000, ge=10_000, le=10**9, description="Most pixels in one image."

@@ -35,13 +35,13 @@ _CLOCK_US = 7_214_336_541
 """What the phone's clock shows at the first picture, microseconds."""
 
 
-def _jpeg(picture: NDArray[np.uint8], **options: Any) -> bytes:
+def jpeg(picture: NDArray[np.uint8], **options: Any) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "JPEG", quality=92, **options)
     return buffer.getvalue()
 
 
-def _png(array: NDArray[Any]) -> bytes:
+def png(array: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(array).save(buffer, "PNG")
     return buffer.getvalue()
@@ -64,7 +64,7 @@ def _matrix(pose: Floats) -> list[list[float]]:
     return [[float(value) for value in row] for row in np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])]
 
 
-def _named(truth: CamerasFile, names: dict[int, str]) -> CamerasFile:
+def named(truth: CamerasFile, names: dict[int, str]) -> CamerasFile:
     """The truth of those images alone, under their names in the archive."""
     return replace(
         truth,
@@ -144,11 +144,11 @@ def write_polycam(
             pose = pose_matrix(truth.images[index])
             stem = str(_CLOCK_US + 100_000 * index)
             if index == 0:
-                archive.writestr("thumbnail.jpg", _jpeg(picture[::4, ::4]))
+                archive.writestr("thumbnail.jpg", jpeg(picture[::4, ::4]))
             if index != 2:
-                archive.writestr(f"keyframes/images/{stem}.jpg", _jpeg(picture))
+                archive.writestr(f"keyframes/images/{stem}.jpg", jpeg(picture))
                 if corrected:
-                    archive.writestr(f"keyframes/corrected_images/{stem}.jpg", _jpeg(picture))
+                    archive.writestr(f"keyframes/corrected_images/{stem}.jpg", jpeg(picture))
             if index != 4:
                 drifted = pose.copy()
                 drifted[:, 3] += 0.15 * index / num * np.array([1.0, -0.5, 0.3])
@@ -161,14 +161,14 @@ def write_polycam(
                     )
             depth_mm = np.round(depth_image(low, pose) * 1000.0)
             depth = np.where(depth_mm < 5000, depth_mm, 0).astype(np.uint16)
-            archive.writestr(f"keyframes/depth/{stem}.png", _png(depth))
+            archive.writestr(f"keyframes/depth/{stem}.png", png(depth))
             confidence = np.where(depth > 0, 255, 0).astype(np.uint8)
-            archive.writestr(f"keyframes/confidence/{stem}.png", _png(confidence))
+            archive.writestr(f"keyframes/confidence/{stem}.png", png(confidence))
             if index not in (2, 4):
                 names[index] = f"keyframes/{kind}images/{stem}.jpg"
         identity = [float(value) for value in np.eye(4).ravel()]
         archive.writestr("mesh_info.json", _json({"alignmentTransform": identity}))
-    return _named(truth, names)
+    return named(truth, names)
 
 
 def _polycam_camera(camera: Intrinsics, pose: Floats, index: int) -> str:
@@ -218,7 +218,7 @@ def write_record3d(
             poses.append([*quaternion(pose[:, :3]), *(float(value) for value in pose[:, 3])])
             if index != missing:
                 names[index] = f"{folder}rgb/{index}.jpg"
-                archive.writestr(names[index], _jpeg(picture))
+                archive.writestr(names[index], jpeg(picture))
                 if depth:
                     z = depth_image(reduced(camera), pose_matrix(truth.images[index]))
                     archive.writestr(f"{folder}depth/{index}.exr", _exr(z))
@@ -235,7 +235,7 @@ def write_record3d(
             "cameraType": 1,
         }
         archive.writestr(f"{folder}metadata.json", json.dumps(metadata))
-    return _named(truth, names)
+    return named(truth, names)
 
 
 def write_nerfstudio(
@@ -279,13 +279,13 @@ def write_nerfstudio(
         archive.writestr(f"{folder}transforms.json", _json(transforms))
         for index, picture in enumerate(render_all(truth)):
             if index != missing:
-                archive.writestr(names[index], _jpeg(picture))
+                archive.writestr(names[index], jpeg(picture))
                 if depth:
                     z = depth_image(reduced(camera), pose_matrix(truth.images[index]))
                     counts = np.round(np.clip(z, 0.0, 65.0) * 1000.0).astype(np.uint16)
-                    archive.writestr(f"{folder}depth/{Path(names[index]).stem}.png", _png(counts))
+                    archive.writestr(f"{folder}depth/{Path(names[index]).stem}.png", png(counts))
     del names[missing]
-    return _named(truth, names)
+    return named(truth, names)
 
 
 def write_photos(
@@ -301,8 +301,8 @@ def write_photos(
     with zipfile.ZipFile(path, "w") as archive:
         for index, picture in enumerate(render_all(truth)):
             stored = np.rot90(picture) if exif_orientation == 6 else picture
-            archive.writestr(names[index], _jpeg(np.ascontiguousarray(stored), exif=exif))
-    return _named(truth, names)
+            archive.writestr(names[index], jpeg(np.ascontiguousarray(stored), exif=exif))
+    return named(truth, names)
 
 
 def write_hdr_hevc(

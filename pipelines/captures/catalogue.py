@@ -16,6 +16,7 @@ from pipelines.captures.importers import (
     photos,
     polycam,
     record3d,
+    scanner_app,
     video_file,
 )
 from pipelines.captures.unpack import CaptureArchive
@@ -26,6 +27,7 @@ IMPORTERS: tuple[Importer, ...] = (
     blender.IMPORTER,
     record3d.IMPORTER,
     polycam.IMPORTER,
+    scanner_app.IMPORTER,
     photos.IMPORTER,
 )
 """In order of precedence: the first that claims an upload reads it. `photos` takes any picture."""

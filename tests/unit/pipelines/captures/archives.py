@@ -151,3 +151,32 @@ def record3d_files(
         "EXR_RGBD/metadata.json": json.dumps(values),
         **{f"EXR_RGBD/rgb/{n}.jpg": picture(seed=n) for n in range(count) if n not in absent},
     }
+
+
+def scanner_app_files(count: int = 5, step: int = 3, **frame: Any) -> dict[str, bytes | str]:
+    """An "All Data" export: picture n is of frame `step * n`, at ARKit position (frame, 0.5, -2).
+
+    Depth of frame f: 1 m and f cm, of confidence 2 but for its first row. frame: other values.
+    """
+    size = {"projectionMatrix": [60 / 32, *[0.0] * 4, 61 / 24, *[0.0] * 10]}
+    files: dict[str, bytes | str] = {"All_Data/info.json": "{}"}
+    files["All_Data/thumb_00000.jpg"] = picture(16, 12)
+    confidence = np.full((12, 16), 2, np.uint8)
+    confidence[0] = 1
+    for n in range(count * step):
+        values = {
+            "cameraPoseARFrame": [value for row in pose(float(n), 0.5, -2.0) for value in row],
+            "intrinsics": [60.0, 0, 31.0, 0, 61.0, 23.0, 0, 0, 1],
+            "time": 100 + n / 10,
+            "frame_index": n,
+            **size,
+            **frame,
+        }
+        files[f"All_Data/frame_{n:05d}.json"] = json.dumps(values)
+        files[f"All_Data/depth_{n:05d}.png"] = depth_png(
+            np.full((12, 16), 1000 + 10 * n, np.uint16)
+        )
+        files[f"All_Data/conf_{n:05d}.png"] = depth_png(confidence)
+        if n % step == 0:
+            files[f"All_Data/frame_{n:05d}.jpg"] = picture(seed=n)
+    return files

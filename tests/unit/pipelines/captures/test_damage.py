@@ -24,6 +24,7 @@ from tests.unit.pipelines.captures.archives import (
     picture,
     polycam_files,
     record3d_files,
+    scanner_app_files,
     write_zip,
 )
 from tests.unit.pipelines.captures.importers.test_blender import blender_files
@@ -124,6 +125,7 @@ def test_end_record_with_a_wrong_number(tmp_path: Path, field: int, more: int) -
         (lambda: blender_files(train=4), "transforms_train.json"),
         (record3d_files, "EXR_RGBD/metadata.json"),
         (polycam_files, "keyframes/corrected_cameras/1500000.json"),
+        (lambda: scanner_app_files(4, 1), "All_Data/frame_00002.json"),
     ],
 )
 def test_damaged_json(tmp_path: Path, make: Callable[[], Files], name: str) -> None:
@@ -146,6 +148,7 @@ def test_json_with_every_value_of_another_type(tmp_path: Path, value: str) -> No
     for make, name in (
         (nerfstudio_files, "transforms.json"),
         (record3d_files, "EXR_RGBD/metadata.json"),
+        (lambda: scanner_app_files(4, 1), "All_Data/frame_00002.json"),
     ):
         files: Files = make()
         text = str(files[name])
@@ -156,7 +159,7 @@ def test_json_with_every_value_of_another_type(tmp_path: Path, value: str) -> No
             begin = text.index(f'"{key}": ')
             changed = text[:begin] + f'"{key}": {value}, "was_' + text[begin + 1 :]
             data = zipped(tmp_path, files | {name: changed}, 0)
-            assert outcome(tmp_path / f"{make.__name__}{n}", data)
+            assert outcome(tmp_path / name.replace("/", "_") / str(n), data)
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])

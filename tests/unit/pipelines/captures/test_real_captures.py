@@ -18,6 +18,7 @@ from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.captures.archives import write_zip
+from tests.unit.pipelines.captures.depth_agreement import disagreement
 
 pytestmark = [
     pytest.mark.captures,
@@ -96,19 +97,23 @@ def test_blender_scene_is_posed_and_white_where_it_was_clear(tmp_path: Path) -> 
         assert (image.mode, image.getpixel((2, 2))) == ("RGB", (255, 255, 255))
 
 
-def test_scanner_export_gives_its_photos_and_no_depth(tmp_path: Path) -> None:
+def test_corridor_depth_of_one_frame_is_that_of_the_others(tmp_path: Path) -> None:
     """3D Scanner App: pictures, 16-bit depth, 8-bit confidence and poses in one folder."""
     folder = captures() / "3dscannerapp-corridor"
-    some = [p for p in folder.rglob("*") if p.is_file() and "_000" in p.name]
+    some = [p for p in folder.rglob("*") if p.is_file() and p.stem[-5:] < "00060"]
     workspace, summary = prepared(tmp_path, zip_of(tmp_path / "scan.zip", folder, some))
+    assert (summary["kind"], summary["metric"]) == ("3dscannerapp", True)
+    assert (summary["num_images"], summary["num_depths"], summary["num_poses"]) == (20, 20, 60)
+    (told,) = summary["warnings"]
+    assert "80 pictures in All_Data/ and 40 files in All_Data/ were not used" in told
     record = json.loads((workspace.stage("ingest") / "capture.json").read_text())
-    assert all(Path(image["source"]).name.startswith("frame_") for image in record["images"])
-    assert summary["num_images"] == len(
-        [p for p in some if p.name.startswith("frame_0") and p.suffix == ".jpg"]
-    )
-    told = " ".join(record["warnings"])
-    for words in ("100 pictures", "16 bits", "confidence", "thumbnails", "3D Scanner App"):
-        assert words in told
+    numbers = [int(Path(image["source"]).stem[-5:]) for image in record["images"]]
+    assert numbers == list(range(0, 60, 3))
+    file = CamerasFile.load(workspace.posed_cameras)
+    assert len(file.cameras) == 20  # each frame has a lens of its own
+    assert all(image.world_from_camera[2][1] > 0.9 for image in file.images)  # held upright
+    assert disagreement(file, workspace.images_root, 1) < 0.007
+    assert disagreement(file, workspace.images_root, 3) < 0.012
 
 
 def test_fox_photos_alone_are_images(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from tests.unit.pipelines.captures.archives import (
     picture,
     polycam_files,
     record3d_files,
+    scanner_app_files,
     write_zip,
 )
 
@@ -94,6 +95,7 @@ def test_single_photo_is_refused_with_advice_to_send_many(tmp_path: Path) -> Non
         ("polycam", polycam_files()),
         ("polycam", polycam_files(corrected=False)),
         ("record3d", record3d_files()),
+        ("3dscannerapp", scanner_app_files(2)),
         ("images", {"b.png": picture(kind="PNG"), "sub/a.data": picture()}),
     ],
 )
