@@ -43,3 +43,10 @@ def empty_mesh() -> TriangleMesh:
     """A mesh without vertices."""
     none = np.zeros((0, 3))
     return TriangleMesh(none, np.zeros((0, 3), np.int32), none, none)
+
+
+def unit_normals(normals: Floats) -> Floats:
+    """[V, 3] at length 1; one that has no direction is +Z."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit: Floats = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    return unit

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipelines.errors import ExportError
-from pipelines.exports.formats.glb import is_textured, read_textured
+from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import Ply, read_ply
+from pipelines.exports.mesh import TexturedMesh
 from pipelines.judging.asset_scores import DEFINITIONS, mean_scores, picture_of, score_view
 from pipelines.judging.asset_views import (
     AssetView,
@@ -173,13 +174,11 @@ class _Seen:
 
 def _caster(folder: Path, frame: SceneTransform) -> MeshCaster:
     """The mesh as it is delivered: with its texture, where it has one."""
-    if is_textured(folder / "mesh.glb"):
-        skin = read_textured(folder / "mesh.glb")
-        texture = Texture(skin.uv, skin.texture)
-        return MeshCaster(frame.scene_from_world(skin.vertices), skin.faces, texture)
-    mesh = read_ply(folder / "mesh.ply")
-    colors = None if mesh.colors is None else mesh.colors.astype(np.float32) / 255.0
-    return MeshCaster(frame.scene_from_world(mesh.points), mesh.faces, colors)
+    mesh = read_mesh(folder / "mesh.glb")
+    vertices = frame.scene_from_world(mesh.vertices)
+    if isinstance(mesh, TexturedMesh):
+        return MeshCaster(vertices, mesh.faces, Texture(mesh.uv, mesh.texture))
+    return MeshCaster(vertices, mesh.faces, mesh.colors)
 
 
 def _look_at_mesh(

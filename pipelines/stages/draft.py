@@ -67,7 +67,7 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
     if len(mesh.faces) == 0:
         return _nothing(options, ctx, "no two depth maps agree on a surface")
     skin = _painted(mesh, maps, cameras, options, ctx)
-    glb.write_mesh(ctx.out / "draft.glb", skin)
+    glb.write_mesh(ctx.out / "draft.glb", skin, cameras.metric)
     _save_picture(ctx.out / "draft.jpg", skin, probes[len(probes) // 2], shells[0].bounds.focus)
     return {
         "num_faces": len(mesh.faces),

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.exports.formats.glb import is_textured, read_textured
-from pipelines.exports.formats.ply import read_ply
+from pipelines.exports.formats.glb import read_mesh
+from pipelines.exports.mesh import TexturedMesh
 from pipelines.judging.asset_views import Texture
 from pipelines.judging.depth_scores import known
 from pipelines.nerf.judging.off_path import evenly
@@ -81,12 +81,6 @@ def save_turntable(job: Workspace, path: Path) -> None:
     if focus is not None:
         distance = float(np.linalg.norm(poses[:, :, 3] - focus, axis=1).mean())
         ball = (focus, SHOWN_DISTANCE * distance)
-    folder = job.stage("mesh")
-    if is_textured(folder / "mesh.glb"):
-        skin = read_textured(folder / "mesh.glb")
-        texture = Texture(skin.uv, skin.texture)
-        Image.fromarray(turntable(skin.vertices, skin.faces, texture, ball=ball)).save(path)
-        return
-    mesh = read_ply(folder / "mesh.ply")
-    colors = None if mesh.colors is None else mesh.colors / 255.0
-    Image.fromarray(turntable(mesh.points, mesh.faces, colors, ball=ball)).save(path)
+    mesh = read_mesh(job.stage("mesh") / "mesh.glb")
+    paint = Texture(mesh.uv, mesh.texture) if isinstance(mesh, TexturedMesh) else mesh.colors
+    Image.fromarray(turntable(mesh.vertices, mesh.faces, paint, ball=ball)).save(path)

@@ -1,8 +1,8 @@
 """A triangle mesh as binary glTF 2.0 (`.glb`), with a texture or vertex colours, nothing to fetch.
 
-glTF is right-handed with +Y up, our world has +Z up: positions and normals are written turned,
-(x, y, z) -> (x, z, -y), since some readers ignore node transforms. `COLOR_0` is linear (glTF 2.0,
-section 3.7.2.1), our colours are sRGB: they are converted, into 16-bit so that dark tones keep
+glTF is right-handed with +Y up, our world has +Z up: positions and normals are written turned
+(`pipelines.exports.frame`), since some readers ignore node transforms. `COLOR_0` is linear (glTF
+2.0, section 3.7.2.1), our colours are sRGB: they are converted, into 16-bit so that dark tones keep
 their steps. A texture is a JPEG, which is sRGB as base colours are, and lies in the file. A
 capture's colours contain the light, hence KHR_materials_unlit.
 
@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+from pipelines.exports.frame import Frame
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 
 Floats = NDArray[np.float64]
 
@@ -77,9 +78,18 @@ class _Accessor:
         return plain
 
 
-def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, generator: str = "nerfworks") -> None:
+def srgb_from_linear(linear: Floats) -> Floats:
+    """The inverse of `linear_from_srgb`."""
+    color: Floats = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1 / 2.4) - 0.055
+    )
+    return color
+
+
+def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, metric: bool = False) -> None:
     """Write a mesh of our world, +Z up; its normals may have any length.
 
+    metric: whether a unit is a metre, as glTF would have it; `asset.extras.frame` says which.
     Raises ValueError for an empty mesh, and where shapes or indices do not fit.
     """
     vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
@@ -89,18 +99,18 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, generator: str = "
         raise ValueError(f"normals {normals.shape} must be like {vertices.shape}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("a face names a vertex that does not exist")
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    frame = Frame("y", metric)
+    unit = unit_normals(normals)
     accessors = [
-        _Accessor("POSITION", _y_up(vertices).astype("<f4"), "VEC3", _FLOAT),
-        _Accessor("NORMAL", _y_up(unit).astype("<f4"), "VEC3", _FLOAT),
+        _Accessor("POSITION", frame.of_world(vertices).astype("<f4"), "VEC3", _FLOAT),
+        _Accessor("NORMAL", frame.of_world(unit).astype("<f4"), "VEC3", _FLOAT),
         _colored(mesh),
         _Accessor("", faces.astype("<u4"), "SCALAR", _UINT32),
     ]
-    picture = _jpeg(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
+    picture = jpeg(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
     # Arrays are multiples of 4 bytes by their types; the picture comes last and is padded.
     blobs = [accessor.values.tobytes() for accessor in accessors] + [picture] * bool(picture)
-    document = _document(accessors, [len(blob) for blob in blobs], bool(picture), generator)
+    document = _document(accessors, [len(blob) for blob in blobs], bool(picture), frame.note())
     text = json.dumps(document, separators=(",", ":")).encode("utf-8")
     text += b" " * (-len(text) % 4)
     binary = b"".join(blobs)
@@ -114,17 +124,10 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, generator: str = "
         file.write(struct.pack("<II", len(binary), _BIN) + binary)
 
 
-def is_textured(path: Path) -> bool:
-    """Whether a file that `write_mesh` wrote has a texture. Raises ValueError for another file."""
-    return "images" in _parts(path)[0]
-
-
-def read_textured(path: Path) -> TexturedMesh:
-    """Read back what `write_mesh` wrote of a textured mesh, into our world.
-
-    Raises ValueError for a file without a texture, or that is not one of ours.
-    """
+def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
+    """Read back what `write_mesh` wrote, into our world. Raises ValueError for another file."""
     document, binary = _parts(path)
+    frame = Frame("y")
     try:
         views = [
             binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
@@ -132,17 +135,19 @@ def read_textured(path: Path) -> TexturedMesh:
         ]
         (primitive,) = document["meshes"][0]["primitives"]
         at = primitive["attributes"]
-        picture = views[document["images"][0]["bufferView"]]
         position, normal = (
-            _z_up(np.frombuffer(views[at[name]], "<f4").reshape(-1, 3).astype(np.float64))
+            frame.to_world(np.frombuffer(views[at[name]], "<f4").reshape(-1, 3).astype(np.float64))
             for name in ("POSITION", "NORMAL")
         )
-        uv = np.frombuffer(views[at["TEXCOORD_0"]], "<f4").reshape(-1, 2).astype(np.float64)
         faces = np.frombuffer(views[primitive["indices"]], "<u4").reshape(-1, 3).astype(np.int32)
-        with Image.open(io.BytesIO(picture)) as opened:
+        if "images" not in document:
+            rgba = np.frombuffer(views[at["COLOR_0"]], "<u2").reshape(-1, 4)
+            return TriangleMesh(position, faces, srgb_from_linear(rgba[:, :3] / 65535.0), normal)
+        uv = np.frombuffer(views[at["TEXCOORD_0"]], "<f4").reshape(-1, 2).astype(np.float64)
+        with Image.open(io.BytesIO(views[document["images"][0]["bufferView"]])) as opened:
             texture = np.asarray(opened.convert("RGB"))
     except (KeyError, IndexError, TypeError, OSError, ValueError) as error:
-        raise ValueError(f"{path.name} is no textured mesh of ours: {error}") from error
+        raise ValueError(f"{path.name} is no mesh of ours: {error}") from error
     return TexturedMesh(position, faces, normal, uv, texture)
 
 
@@ -173,25 +178,15 @@ def _colored(mesh: TriangleMesh | TexturedMesh) -> _Accessor:
     return _Accessor("COLOR_0", rgba, "VEC4", _UINT16, normalized=True)
 
 
-def _jpeg(texture: NDArray[np.uint8]) -> bytes:
+def jpeg(texture: NDArray[np.uint8]) -> bytes:
     """The picture as a JPEG with all of its colour resolution."""
     held = io.BytesIO()
     Image.fromarray(texture).save(held, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
     return held.getvalue()
 
 
-def _y_up(vectors: Floats) -> Floats:
-    """(x, y, z) with +Z up -> (x, z, -y) with +Y up: a turn by -90 degrees about X."""
-    return np.stack((vectors[:, 0], vectors[:, 2], -vectors[:, 1]), axis=1)
-
-
-def _z_up(vectors: Floats) -> Floats:
-    """The inverse of `_y_up`."""
-    return np.stack((vectors[:, 0], -vectors[:, 2], vectors[:, 1]), axis=1)
-
-
 def _document(
-    accessors: list[_Accessor], sizes: list[int], has_picture: bool, generator: str
+    accessors: list[_Accessor], sizes: list[int], has_picture: bool, note: str
 ) -> dict[str, Any]:
     """The JSON part. sizes: bytes of each accessor, then of the picture where there is one."""
     offsets = [sum(sizes[:i]) for i in range(len(sizes))]
@@ -204,7 +199,7 @@ def _document(
     names = [accessor.name for accessor in accessors]
     material = _MATERIAL
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": generator},
+        "asset": {"version": "2.0", "generator": "nerfworks", "extras": {"frame": note}},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

@@ -1,6 +1,6 @@
 """PLY files: point clouds and triangle meshes with colours and normals, binary little endian.
 
-Symbols: V vertices, F triangles. Positions are float32 in the world frame of `cameras.json`,
+Symbols: V vertices, F triangles. Positions are float32, their axes are told in a comment,
 colours are sRGB uint8, normals are unit vectors. The reader understands what the writers here
 write and what common programs write: any scalar types, further properties (skipped), polygons
 (split into fans), binary little endian.
@@ -18,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TriangleMesh
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -43,6 +44,7 @@ _SCALARS = {
     "float64": "<f8",
 }
 _MAX_HEADER_LINES = 1000
+_WORLD = Frame()
 
 
 @dataclass(frozen=True)
@@ -64,22 +66,26 @@ def write_points(
     points: FloatArray,
     colors: ByteArray | None = None,
     normals: FloatArray | None = None,
+    frame: Frame = _WORLD,
 ) -> None:
     """Write a point cloud.
 
-    points: [V, 3]. colors: [V, 3] uint8, sRGB. normals: [V, 3], unit.
+    points: [V, 3] world. colors: [V, 3] uint8, sRGB. normals: [V, 3], unit. frame: of the file.
     Raises ValueError for shapes or types that do not fit.
     """
-    vertices = _vertex_records(points, colors, normals)
+    vertices = _vertex_records(points, colors, normals, frame)
     with path.open("wb") as file:
-        file.write(_header(vertices, num_faces=None))
+        file.write(_header(vertices, None, frame))
         file.write(vertices.tobytes())
 
 
-def write_mesh(path: Path, mesh: TriangleMesh) -> None:
-    """Write a triangle mesh. Raises ValueError for shapes, types or indices that do not fit."""
+def write_mesh(path: Path, mesh: TriangleMesh, frame: Frame = _WORLD) -> None:
+    """Write a triangle mesh of the world. frame: of the file.
+
+    Raises ValueError for shapes, types or indices that do not fit.
+    """
     colors = np.rint(255.0 * np.clip(mesh.colors, 0.0, 1.0)).astype(np.uint8)
-    records, faces = _vertex_records(mesh.vertices, colors, mesh.normals), mesh.faces
+    records, faces = _vertex_records(mesh.vertices, colors, mesh.normals, frame), mesh.faces
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise ValueError(f"faces must be [F, 3], not {list(faces.shape)}")
     if faces.size and (faces.min() < 0 or faces.max() >= len(records)):
@@ -90,7 +96,7 @@ def write_mesh(path: Path, mesh: TriangleMesh) -> None:
     triangles["count"] = 3
     triangles["index"] = faces
     with path.open("wb") as file:
-        file.write(_header(records, num_faces=len(faces)))
+        file.write(_header(records, len(faces), frame))
         file.write(records.tobytes())
         file.write(triangles.tobytes())
 
@@ -120,18 +126,18 @@ def read_ply(path: Path) -> Ply:
 
 
 def _vertex_records(
-    points: FloatArray, colors: ByteArray | None, normals: FloatArray | None
+    points: FloatArray, colors: ByteArray | None, normals: FloatArray | None, frame: Frame
 ) -> npt.NDArray[np.void]:
     """The vertices as packed records, checked."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points must be [V, 3], not {list(points.shape)}")
     fields: list[tuple[str, str]] = [(name, "<f4") for name in ("x", "y", "z")]
-    parts: list[npt.NDArray[Any]] = [points]
+    parts: list[npt.NDArray[Any]] = [frame.of_world(points.astype(np.float64, copy=False))]
     if normals is not None:
         if normals.shape != points.shape:
             raise ValueError(f"normals are {list(normals.shape)}, points {list(points.shape)}")
         fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
-        parts.append(normals)
+        parts.append(frame.of_world(normals.astype(np.float64, copy=False)))
     if colors is not None:
         if colors.shape != points.shape or colors.dtype != np.uint8:
             raise ValueError(f"colors must be uint8 {list(points.shape)}, not {colors.dtype}")
@@ -144,9 +150,10 @@ def _vertex_records(
     return records
 
 
-def _header(vertices: npt.NDArray[np.void], num_faces: int | None) -> bytes:
+def _header(vertices: npt.NDArray[np.void], num_faces: int | None, frame: Frame) -> bytes:
     """The text before the records; without faces where `num_faces` is None."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {frame.note()}"]
+    lines.append(f"element vertex {len(vertices)}")
     for name in vertices.dtype.names or ():
         kind = "uchar" if vertices.dtype[name].itemsize == 1 else "float"
         lines.append(f"property {kind} {name}")

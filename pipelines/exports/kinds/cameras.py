@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines.errors import ExportError
 from pipelines.exports.export import Export
+from pipelines.exports.frame import Frame
 from pipelines.option_models import StageOptions
 from pipelines.stage import Artifact, StageContext
 
@@ -38,7 +39,8 @@ def run(scene: TrainedScene, options: CamerasOptions, ctx: StageContext) -> dict
         except ExportError as error:
             ctx.logger.warning("no %s: %s", name, error.message)
             left_out[name] = error.message
-    ply.write_mesh(ctx.out / "cameras.ply", camera_frusta(scene.cameras))
+    frame = Frame(metric=scene.cameras.metric)
+    ply.write_mesh(ctx.out / "cameras.ply", camera_frusta(scene.cameras), frame)
     return {
         "num_images": len(scene.cameras.images),
         "num_lenses": len(scene.cameras.cameras),
@@ -48,7 +50,7 @@ def run(scene: TrainedScene, options: CamerasOptions, ctx: StageContext) -> dict
 
 EXPORT = Export(
     kind="cameras",
-    version=1,
+    version=2,
     run=run,
     options=CamerasOptions,
     needs_gpu=False,

@@ -1,30 +1,55 @@
-"""The mesh: rendered depth fused into triangles, as PLY and GLB.
+"""The mesh: rendered depth fused into triangles, in the formats asked for.
 
-`mesh.ply` is in the world frame of cameras.json and has the field's colours on its vertices;
-`mesh.glb` has +Y up, as glTF demands, and a texture from the training photos.
+All of them lie in the world of cameras.json (`pipelines.exports.frame`); GLB and USDZ have +Y up.
+GLB, OBJ and USDZ have a texture from the training photos, PLY the field's colours on its vertices,
+STL is shape alone.
 """
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipelines.errors import ExportError
 from pipelines.exports.export import Export
+from pipelines.exports.frame import Axis, Frame
 from pipelines.exports.options import CropOptions, TextureOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
+    from pipelines.exports.mesh import TexturedMesh, TriangleMesh
     from pipelines.scene.trained_scene import TrainedScene
 
+Format = Literal["glb", "ply", "obj", "stl", "usdz"]
+
+_FILES: dict[Format, str] = {
+    "glb": "mesh.glb",
+    "ply": "mesh.ply",
+    "obj": "mesh.obj.zip",
+    "stl": "mesh.stl",
+    "usdz": "mesh.usdz",
+}
 _RENDER_SHARE, _FUSE_SHARE, _TEXTURE_SHARE = 0.6, 0.8, 0.97
 
 
 class MeshOptions(CropOptions, TextureOptions):
     """The mesh, by fusing rendered depth (TSDF)."""
+
+    formats: tuple[Format, ...] = Field(
+        ("glb", "ply"),
+        min_length=1,
+        max_length=5,
+        description="Files that are written: glb, ply, obj (a zip with its material and picture), "
+        "stl, usdz. glb must be among them: the job's assessment looks at it.",
+    )
+    up_axis: Axis = Field(
+        "z",
+        description="Which axis is up in ply, obj and stl. In glb and usdz it is always y.",
+    )
 
     resolution: int = Field(
         256, ge=32, le=2048, description="Voxels along the longest side of the subject."
@@ -43,11 +68,17 @@ class MeshOptions(CropOptions, TextureOptions):
         "shell.",
     )
 
+    @field_validator("formats")
+    @classmethod
+    def _each_once_and_glb(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:
+        if "glb" not in formats:
+            raise ValueError("must have glb among them")
+        return tuple(dict.fromkeys(formats))
+
 
 def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[str, Any]:
     """Make the mesh. Raises ExportError `empty_mesh` where the model shows no surface."""
     # Imported where it runs: the API reads this file too.
-    from pipelines.exports.formats import glb, ply
     from pipelines.exports.mesh import TexturedMesh
     from pipelines.exports.surface.shells import find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
@@ -79,7 +110,6 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         )
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
-    ply.write_mesh(ctx.out / "mesh.ply", mesh)
     shown = scene.training_images()
     skin = painted(
         mesh,
@@ -89,8 +119,10 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         ctx,
         (_FUSE_SHARE, _TEXTURE_SHARE),
     )
-    glb.write_mesh(ctx.out / "mesh.glb", skin)
+    ctx.progress(_TEXTURE_SHARE, "writing")
+    _write(mesh, skin, options, ctx, scene.cameras.metric)
     return {
+        "formats": list(options.formats),
         "texture_px": len(skin.texture) if isinstance(skin, TexturedMesh) else None,
         "num_vertices": len(mesh.vertices),
         "num_faces": len(mesh.faces),
@@ -101,6 +133,29 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             {"voxel": round(shell.voxel, 9), **shell.bounds.as_dict()} for shell in shells[1:]
         ],
     }
+
+
+def _write(
+    mesh: TriangleMesh,
+    skin: TriangleMesh | TexturedMesh,
+    options: MeshOptions,
+    ctx: StageContext,
+    metric: bool,
+) -> None:
+    """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
+    from pipelines.exports.formats import glb, obj, ply, stl, usdz
+
+    frame = Frame(options.up_axis, metric)
+    writers: dict[Format, Callable[[Path], None]] = {
+        "glb": lambda path: glb.write_mesh(path, skin, metric),
+        "ply": lambda path: ply.write_mesh(path, mesh, frame),
+        "obj": lambda path: obj.write_mesh(path, skin, frame),
+        "stl": lambda path: stl.write_mesh(path, mesh, frame),
+        "usdz": lambda path: usdz.write_mesh(path, skin, metric),
+    }
+    for name in options.formats:
+        ctx.check_cancelled()
+        writers[name](ctx.out / _FILES[name])
 
 
 def _empty(why: str) -> ExportError:
@@ -114,7 +169,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=4,
+    version=5,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,
@@ -123,5 +178,8 @@ EXPORT = Export(
         Artifact(
             "mesh.ply", "mesh.ply", "application/octet-stream", "MeshLab, CloudCompare, Blender"
         ),
+        Artifact("mesh.obj.zip", "mesh.obj.zip", "application/zip", "unpacked: any 3D program"),
+        Artifact("mesh.stl", "mesh.stl", "model/stl", "slicers for 3D printing"),
+        Artifact("mesh.usdz", "mesh.usdz", "model/vnd.usdz+zip", "iPhone, iPad, Mac, Blender"),
     ),
 )

@@ -15,6 +15,7 @@ from pydantic import Field
 
 from pipelines.errors import ExportError
 from pipelines.exports.export import Export
+from pipelines.exports.frame import Frame
 from pipelines.exports.options import CropOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
@@ -72,7 +73,8 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     ctx.progress(0.92, "estimating normals")
     normals = clouds.oriented_normals(cloud, bounds.focus)
     ctx.progress(0.97, "writing")
-    ply.write_points(ctx.out / "pointcloud.ply", cloud.points, cloud.colors, normals)
+    frame = Frame(metric=scene.cameras.metric)
+    ply.write_points(ctx.out / "pointcloud.ply", cloud.points, cloud.colors, normals, frame)
     return {"num_points": len(cloud), "num_views": len(images), "bounds": bounds.as_dict()}
 
 
@@ -86,7 +88,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=3,
+    version=4,
     reads=("depth",),
     run=run,
     options=PointcloudOptions,

@@ -46,3 +46,27 @@ def test_wrong_values_are_refused_with_their_path(wrong: dict[str, object]) -> N
     with pytest.raises(OptionsError) as caught:
         resolve_options("preview", {"mesh": {"render": wrong}})
     assert f"mesh.render.{next(iter(wrong))}" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stage", "wrong", "told"),
+    [
+        ("mesh", {"formats": ["ply"]}, "must have glb among them"),
+        ("mesh", {"formats": []}, "at least 1"),
+        ("mesh", {"formats": ["glb", "fbx"]}, "'glb', 'ply', 'obj', 'stl' or 'usdz'"),
+        ("mesh", {"up_axis": "x"}, "'z' or 'y'"),
+    ],
+)
+def test_wrong_requests_are_refused_with_the_range(
+    stage: str, wrong: dict[str, object], told: str
+) -> None:
+    with pytest.raises(OptionsError) as caught:
+        resolve_options("preview", {stage: wrong})
+    assert told in str(caught.value)
+    assert f"{stage}.{next(iter(wrong))}" in str(caught.value)
+
+
+def test_a_format_asked_for_twice_is_written_once() -> None:
+    assert resolve_options("preview", {"mesh": {"formats": ["glb", "stl", "glb"]}})["mesh"][
+        "formats"
+    ] == ["glb", "stl"]

@@ -12,12 +12,12 @@ import open3d
 import pytest
 
 from pipelines.exports.formats.glb import (
-    is_textured,
     linear_from_srgb,
-    read_textured,
+    read_mesh,
     write_mesh,
 )
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+from tests.gltf_validator import problems_of, report_of
 
 VERTICES = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -121,9 +121,8 @@ def textured(tmp_path: Path) -> Path:
 
 
 def test_a_texture_lies_in_the_file_and_comes_back(textured: Path, file: Path) -> None:
-    assert is_textured(textured)
-    assert not is_textured(file)
-    mesh = read_textured(textured)
+    mesh = read_mesh(textured)
+    assert isinstance(mesh, TexturedMesh)
     np.testing.assert_allclose(mesh.vertices, VERTICES, atol=1e-6)
     np.testing.assert_array_equal(mesh.faces, FACES)
     np.testing.assert_allclose(mesh.uv, [[0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]], atol=1e-6)
@@ -134,6 +133,10 @@ def test_a_texture_lies_in_the_file_and_comes_back(textured: Path, file: Path) -
         ((50, 30), (30, 30, 200)),
     ):
         assert np.abs(mesh.texture[place].astype(int) - wanted).max() < 12
+    plain = read_mesh(file)
+    assert isinstance(plain, TriangleMesh)
+    np.testing.assert_allclose(plain.vertices, VERTICES, atol=1e-6)
+    np.testing.assert_allclose(plain.colors, COLORS, atol=1e-3)
 
 
 def test_a_textured_document_is_as_the_specification_wants_it(textured: Path) -> None:
@@ -160,16 +163,37 @@ def test_open3d_reads_a_textured_mesh(textured: Path) -> None:
     assert mesh.has_triangle_uvs()
 
 
-def test_files_that_are_no_textured_mesh_are_refused(tmp_path: Path, file: Path) -> None:
-    with pytest.raises(ValueError, match=r"mesh\.glb is no textured mesh"):
-        read_textured(file)
+def test_files_that_are_no_mesh_of_ours_are_refused(tmp_path: Path, file: Path) -> None:
     broken = tmp_path / "broken.glb"
     for content in (b"", b"glTF", b"PK" * 20, file.read_bytes()[:60]):
         broken.write_bytes(content)
         with pytest.raises(ValueError, match=r"broken\.glb is no"):
-            is_textured(broken)
+            read_mesh(broken)
     uv = np.zeros((3, 2))
     with pytest.raises(ValueError, match="uv"):
         write_mesh(
             broken, TexturedMesh(VERTICES, FACES, NORMALS, uv, np.zeros((4, 4, 3), np.uint8))
         )
+
+
+@pytest.mark.parametrize("kind", ["file", "textured"])
+def test_the_khronos_validator_finds_no_fault(kind: str, request: pytest.FixtureRequest) -> None:
+    path: Path = request.getfixturevalue(kind)
+    assert problems_of(path) == []
+    info = report_of(path)["info"]
+    assert (info["totalVertexCount"], info["totalTriangleCount"]) == (4, 4)
+    assert info["hasTextures"] == (kind == "textured")
+
+
+def test_the_khronos_validator_finds_planted_faults(tmp_path: Path) -> None:
+    long = TriangleMesh(VERTICES, FACES, COLORS, np.tile([0.0, 0.0, 1.0], (4, 1)))
+    path = tmp_path / "mesh.glb"
+    write_mesh(path, long)
+    data = bytearray(path.read_bytes())
+    begin = 28 + int.from_bytes(data[12:16], "little")
+    data[begin + 48 : begin + 60] = np.array([0.0, 2.0, 0.0], "<f4").tobytes()  # a normal
+    data[begin + 128 + 12] = 9  # an index
+    path.write_bytes(data)
+    found = " ".join(problems_of(path))
+    assert "ACCESSOR_VECTOR3_NON_UNIT" in found
+    assert "ACCESSOR_INDEX_OOB" in found

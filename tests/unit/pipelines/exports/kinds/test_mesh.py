@@ -9,8 +9,9 @@ import open3d
 import pytest
 
 from pipelines.errors import Cancelled, ExportError
-from pipelines.exports.formats.glb import is_textured, read_textured
+from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
+from pipelines.exports.mesh import TexturedMesh
 from pipelines.exports.texture import charts
 from pipelines.manifest import RunHooks
 from pipelines.workspace import Workspace
@@ -38,7 +39,8 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
     job: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     summary = tiny_job.run(job, "mesh")["summary"]
-    painted = read_textured(job.stage("mesh") / "mesh.glb")
+    painted = read_mesh(job.stage("mesh") / "mesh.glb")
+    assert isinstance(painted, TexturedMesh)
     mesh = read_ply(job.stage("mesh") / "mesh.ply")
     assert len(painted.faces) == len(mesh.faces)
     assert painted.texture.shape[:2] == (summary["texture_px"],) * 2
@@ -51,7 +53,7 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
             monkeypatch.setattr(charts, "_MARGIN_PX", 40)
         plain = tiny_job.run(job, "mesh", **spoil)["summary"]
         assert plain["texture_px"] is None
-        assert not is_textured(job.stage("mesh") / "mesh.glb")
+        assert not isinstance(read_mesh(job.stage("mesh") / "mesh.glb"), TexturedMesh)
         assert ("keeps the colours of its vertices" in caplog.text) == full
 
 

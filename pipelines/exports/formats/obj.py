@@ -1,0 +1,66 @@
+"""A triangle mesh as Wavefront OBJ with its material and picture, in one zip.
+
+`mesh.obj`, `mesh.mtl`, and `mesh.png` where the mesh is textured; else each vertex carries its
+colour behind its position (`v x y z r g b`, sRGB), which MeshLab, Blender and Open3D read. Texture
+coordinates of OBJ have their origin at the picture's bottom left. Numbers have nine digits, which
+hold a float32.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipelines.exports.formats.archive import entry
+from pipelines.exports.frame import Frame
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
+
+_ROWS = 50_000
+_MATERIAL = "newmtl captured\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\n"
+
+
+def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, frame: Frame) -> None:
+    """Write the zip with a mesh of the world. frame: of the file."""
+    textured = isinstance(mesh, TexturedMesh)
+    with zipfile.ZipFile(path, "w") as archive:
+        with archive.open(entry("mesh.obj"), "w", force_zip64=True) as file:
+            for text in _lines(mesh, frame):
+                file.write(text.encode("ascii"))
+        material = _MATERIAL + ("map_Kd mesh.png\n" if textured else "")
+        archive.writestr(entry("mesh.mtl"), material)
+        if isinstance(mesh, TexturedMesh):
+            held = io.BytesIO()
+            Image.fromarray(mesh.texture).save(held, "PNG")
+            archive.writestr(entry("mesh.png", compressed=False), held.getvalue())
+
+
+def _lines(mesh: TriangleMesh | TexturedMesh, frame: Frame) -> Iterator[str]:
+    """The text of `mesh.obj`, in pieces."""
+    yield f"# nerfworks: {frame.note()}\nmtllib mesh.mtl\no mesh\n"
+    positions = frame.of_world(mesh.vertices)
+    if isinstance(mesh, TexturedMesh):
+        yield from _rows("v %.9g %.9g %.9g\n", positions)
+        up = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1)
+        yield from _rows("vt %.9g %.9g\n", up)
+        corner = "%d/%d/%d"
+    else:
+        colored = np.concatenate([positions, np.clip(mesh.colors, 0.0, 1.0)], axis=1)
+        yield from _rows("v %.9g %.9g %.9g %.4f %.4f %.4f\n", colored)
+        corner = "%d//%d"
+    yield from _rows("vn %.6f %.6f %.6f\n", frame.of_world(unit_normals(mesh.normals)))
+    yield "usemtl captured\n"
+    times = corner.count("%d")
+    numbers = np.repeat(mesh.faces.astype(np.int64) + 1, times, axis=1)
+    yield from _rows(f"f {corner} {corner} {corner}\n", numbers)
+
+
+def _rows(template: str, values: NDArray[np.float64] | NDArray[np.int64]) -> Iterator[str]:
+    """Each row through the template, so many at a time."""
+    for start in range(0, len(values), _ROWS):
+        yield "".join([template % tuple(row) for row in values[start : start + _ROWS].tolist()])
