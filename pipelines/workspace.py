@@ -3,7 +3,8 @@
 JOB/
   input/capture             the uploaded bytes, as they came
   job.json                  filename, kind, seed: what the stages may know of the job
-  ingest/                   capture.json, images/ (photos and app exports), cameras.json (posed)
+  ingest/                   capture.json, images/ (photos and app exports), cameras.json (posed),
+                            points.ply (posed, where sparse points came along)
   frames/                   frames.json, images/ (only for videos)
   poses/                    cameras.json, report.json, points.ply (only where no poses came)
   depth/                    maps.json, maps/, depth.jpg, report.json
@@ -27,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 MANIFEST = "manifest.json"
+SPARSE_POINTS = "points.ply"
 
 
 @dataclass(frozen=True)
@@ -82,3 +84,8 @@ class Workspace:
     def posed_cameras(self) -> Path:
         """`cameras.json` as it enters training: from `poses`, or from the capture itself."""
         return self.stage("poses" if self.is_complete("poses") else "ingest") / "cameras.json"
+
+    @property
+    def sparse_points(self) -> Path:
+        """`points.ply`, in the world of `posed_cameras`; poses may have come without one."""
+        return self.posed_cameras.with_name(SPARSE_POINTS)

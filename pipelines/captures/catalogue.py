@@ -12,6 +12,7 @@ from pipelines.captures.contents import Contents
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.importers import (
     blender,
+    colmap,
     nerfstudio,
     photos,
     polycam,
@@ -28,6 +29,7 @@ IMPORTERS: tuple[Importer, ...] = (
     record3d.IMPORTER,
     polycam.IMPORTER,
     scanner_app.IMPORTER,
+    colmap.IMPORTER,
     photos.IMPORTER,
 )
 """In order of precedence: the first that claims an upload reads it. `photos` takes any picture."""

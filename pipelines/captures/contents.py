@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from pipelines.errors import CaptureError
 from pipelines.scene.cameras_file import Intrinsics
 
 Rows = tuple[tuple[float, ...], ...]
 """A matrix [3, 4]: rotation and position, row-major."""
+
+Up = Literal["known", "assumed", "unknown"]
+"""Where a world's up is: +Z; +Z only because files of this format mostly have it so; anywhere, as
+structure from motion leaves it."""
 
 
 @dataclass(frozen=True)
@@ -69,22 +73,34 @@ class PosedSource:
 
 
 @dataclass(frozen=True)
+class SparsePoints:
+    """Points that the program which found the poses has found with them.
+
+    places: P rows of three numbers, in the world of the poses. colors: P rows of red, green, blue,
+    0 to 255.
+    """
+
+    places: Sequence[Sequence[float]]
+    colors: Sequence[Sequence[int]]
+
+
+@dataclass(frozen=True)
 class PosedPictures:
     """A capture that brings its poses.
 
     sources: in the order of the capture. failures: why frames beside those cannot be used, one
     error for each; few are passed over, many fail the capture.
-    up_assumed: whether +Z is up only because files of this format mostly have it so.
-    metric: whether the world's unit is the metre. is_dense: whether neighbours are so alike that a
-    long capture may be thinned. notes: about the world, for `cameras.json`. details, warnings: for
-    the record.
+    up: see `Up`. metric: whether the world's unit is the metre. points: in the same world, or None.
+    is_dense: whether neighbours are so alike that a long capture may be thinned. notes: about the
+    world, for `cameras.json`. details, warnings: for the record.
     """
 
     sources: Sequence[PosedSource]
     metric: bool
     failures: Sequence[CaptureError] = ()
     is_dense: bool = False
-    up_assumed: bool = False
+    up: Up = "known"
+    points: SparsePoints | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
     warnings: Sequence[str] = ()

@@ -11,7 +11,7 @@ import posixpath
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from pipelines.captures.roles import named_role
+from pipelines.captures.roles import folder_role, named_role
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 
@@ -67,6 +67,36 @@ class NamedFiles:
             if path not in exact and (name := self.by_its_end(path)) and name not in taken
         }
         return exact, _unique(loose)
+
+
+def folder_of(names: Iterable[str], paths: Iterable[str], near: str = "") -> str:
+    """The folder that most of the paths are relative to, "" or ending with "/".
+
+    Of several, as `images/` and its reduced copy `images_2/`: none for masks or depth maps, then
+    one called `images`, then the one that shares most with `near`, then the least deep.
+    """
+    by_base: dict[str, list[str]] = {}
+    for name in names:
+        by_base.setdefault(name.rpartition("/")[2], []).append(name)
+    counts: Counter[str] = Counter()
+    for path in {posixpath.normpath(_plain(path)).lstrip("/") for path in paths}:
+        base = path.rpartition("/")[2]
+        for wanted in (path + end for end in _SUFFIXES if base + end in by_base):
+            for name in by_base[wanted.rpartition("/")[2]]:
+                if name == wanted or name.endswith("/" + wanted):
+                    counts[name[: len(name) - len(wanted)]] += 1
+
+    def rank(folder: str) -> tuple[int, bool, bool, int, int, str]:
+        return (
+            -counts[folder],
+            folder_role(folder) is not None,
+            not f"/{folder}".endswith("/images/"),
+            -len(posixpath.commonprefix([folder, near])),
+            folder.count("/"),
+            folder,
+        )
+
+    return min(counts, key=rank, default=near)
 
 
 def _plain(path: str) -> str:

@@ -6,7 +6,7 @@ Standard library only. Poses are rows [3, 4], `world_from_camera`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -23,20 +23,17 @@ FRAME_FAULTS = frozenset({"poses_malformed", "poses_missing", "image_undecodable
 Frame = TypeVar("Frame")
 
 
-def malformed(message: str) -> CaptureError:
+def malformed(message: str, hint: str = "Export the capture again from the app.") -> CaptureError:
     """The error for poses or intrinsics that make no sense."""
-    return CaptureError(
-        message, code="poses_malformed", hint="Export the capture again from the app."
-    )
+    return CaptureError(message, code="poses_malformed", hint=hint)
 
 
-def missing(message: str) -> CaptureError:
+def missing(
+    message: str,
+    hint: str = "Export the capture with its poses, or send the pictures alone to have them found.",
+) -> CaptureError:
     """The error for poses that are not there."""
-    return CaptureError(
-        message,
-        code="poses_missing",
-        hint="Export the capture with its poses, or send the pictures alone to have them found.",
-    )
+    return CaptureError(message, code="poses_missing", hint=hint)
 
 
 def number(value: Any, what: str) -> float:
@@ -69,6 +66,35 @@ def pose_rows(rows: Any, what: str) -> Rows:
 def z_up_from_y_up(rows: Rows) -> Rows:
     """A pose in ARKit's gravity frame (+Y up), in ours (+Z up): x' = z, y' = x, z' = y."""
     return (rows[2], rows[0], rows[1])
+
+
+def rotation_of(quaternion: Sequence[float], what: str) -> Rows:
+    """The rotation of a quaternion (x, y, z, w) of any length but zero. Rows [3, 3].
+
+    Raises CaptureError poses_malformed.
+    """
+    length = math.sqrt(sum(value * value for value in quaternion))
+    if not 0.5 < length < 2.0:
+        raise malformed(f"The pose of {what} has no rotation.")
+    x, y, z, w = (value / length for value in quaternion)
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def pose_of_opencv(camera_from_world: Rows, translation: Sequence[float]) -> Rows:
+    """Our pose, of a rotation [3, 3] and a translation that turn the world into an OpenCV camera.
+
+    So photogrammetry programs write it: x_camera = rotation @ x_world + translation, +Y down, looks
+    along +Z. Rows [3, 4].
+    """
+    r, t = camera_from_world, translation
+    return tuple(
+        (r[0][i], -r[1][i], -r[2][i], -(r[0][i] * t[0] + r[1][i] * t[1] + r[2][i] * t[2]))
+        for i in range(3)
+    )
 
 
 def each_frame(

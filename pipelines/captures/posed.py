@@ -12,25 +12,21 @@ import numpy as np
 import numpy.typing as npt
 
 from pipelines.captures.archive_rules import shown
-from pipelines.captures.contents import PosedPictures, PosedSource, Rows
+from pipelines.captures.contents import PosedPictures, PosedSource, Rows, SparsePoints
 from pipelines.captures.depth_files import DepthWriter
 from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.captures.parsing import malformed
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
-from pipelines.captures.record import Found
+from pipelines.captures.record import Found, FoundPoints
 from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
+from pipelines.captures.world import Move, settled
 from pipelines.options import IngestOptions
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
-from pipelines.scene.orientation import find_up, rotation_to_z
 from pipelines.stage import StageContext
 
 Matrix = npt.NDArray[np.float64]
 
-_CLEARLY = 0.8
-"""Cosine up to which an axis of the world is the vertical, and nothing else is."""
-_SIDEWAYS = 0.7
-"""Mean height of the cameras' X axes above which pictures may be upright ones stored sideways."""
 _SLACK = 0.05
 """How far a rotation may be from orthonormal before it is called malformed; files are rounded."""
 
@@ -90,14 +86,9 @@ def write_posed(
     )
     cameras: dict[Intrinsics, int] = {}
     poses = np.array([item.world_from_camera for item in stored], np.float64)
-    notes = dict(capture.notes)
-    turned = other_axis_up(poses) if capture.up_assumed else None
-    if turned is not None:
-        axis, rotation = turned
-        poses = rotation @ poses
-        before = np.array(notes.get("applied_transform", np.eye(3, 4).tolist()), np.float64)
-        notes |= {"up": axis, "applied_transform": (rotation @ before).tolist()}
-        warnings.append(f"In the pictures {axis} of the file's world is up, not +Z: it was turned.")
+    orientations = [item.picture.exif.orientation for item in stored]
+    move = settled(poses, orientations, capture.up, capture.notes)
+    poses = move.poses(poses)
     images = tuple(
         PosedImage(
             file=item.picture.file,
@@ -114,7 +105,7 @@ def write_posed(
         images=images,
         metric=capture.metric,
         source=source,
-        notes=notes,
+        notes=move.notes,
     ).save(ctx.out / "cameras.json")
     return Found(
         images=[item.picture.as_dict() for item in stored],
@@ -125,7 +116,8 @@ def write_posed(
             "metric": capture.metric,
             **capture.details,
         },
-        warnings=[*capture.warnings, *warnings, *depths.warnings],
+        warnings=[*capture.warnings, *warnings, *move.warnings, *depths.warnings],
+        points=None if capture.points is None else _points(capture.points, move),
     )
 
 
@@ -155,24 +147,20 @@ def _store(depths: DepthWriter, writer: PictureWriter, source: PosedSource, numb
     )
 
 
+def _points(points: SparsePoints, move: Move) -> FoundPoints | None:
+    """The points that are in some place, in the world of the poses; None where none is."""
+    places = np.array(points.places, np.float64).reshape(-1, 3)
+    colors = np.array(points.colors, np.float64).reshape(-1, 3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = move.points(places).astype(np.float32)
+    kept = np.isfinite(moved).all(axis=1) & np.isfinite(colors).all(axis=1)
+    if not kept.any():
+        return None
+    return FoundPoints(moved[kept], np.clip(colors[kept], 0, 255).astype(np.uint8))
+
+
 def _rows(pose: Matrix) -> Rows:
     return tuple(tuple(float(value) for value in row) for row in pose)
-
-
-def other_axis_up(poses: Matrix) -> tuple[str, Matrix] | None:
-    """The axis of a world that is up in its pictures, and the quarter turn that makes it +Z.
-
-    poses: [N, 3, 4], OpenGL cameras. None where that is +Z, and where it is not clear: pictures
-    stored on their side have level X axes in a world that lies.
-    """
-    up, found_by = find_up(poses)
-    axis = int(np.abs(up).argmax())
-    sideways = float(np.abs(poses[:, 2, 0]).mean()) > _SIDEWAYS
-    if found_by != "vertical" or sideways or abs(up[axis]) < _CLEARLY or up[2] >= _CLEARLY:
-        return None
-    direction = np.zeros(3)
-    direction[axis] = np.sign(up[axis])
-    return f"{'+' if direction[axis] > 0 else '-'}{'XYZ'[axis]}", rotation_to_z(direction)
 
 
 def checked_pose(matrix: Matrix, what: str) -> Matrix:

@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 CAPTURE_JSON = "capture.json"
 
 
@@ -42,10 +45,22 @@ class CaptureRecord:
 
 
 @dataclass(frozen=True)
+class FoundPoints:
+    """Points in the world of `cameras.json`. places: [P, 3] float32. colors: [P, 3] uint8."""
+
+    places: npt.NDArray[np.float32]
+    colors: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
 class Found:
-    """What the reader of one kind of capture has written below the stage's folder."""
+    """What the reader of one kind of capture has written below the stage's folder.
+
+    points: to be written beside its `cameras.json`, or None.
+    """
 
     images: list[dict[str, Any]] = field(default_factory=list)
     video: dict[str, Any] | None = None
     details: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    points: FoundPoints | None = None

@@ -14,7 +14,6 @@ brought the poses from that world to the file's: nerfstudio multiplies depth by 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,6 +21,7 @@ from typing import Any
 
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedSource, SensorDepth
+from pipelines.captures.listed_pictures import listing_warnings, none_there
 from pipelines.captures.named_files import NamedFiles
 from pipelines.captures.parsing import (
     each_frame,
@@ -130,7 +130,7 @@ def read_frames(
         if frame.path in found:
             there.setdefault(found[frame.path], frame)
     if not there:
-        raise (failures or [_none_there(file, len(listed))])[0]
+        raise (failures or [none_there(file, [frame.path for frame in frames])])[0]
     depths = _Depths()
     if with_depth:
         taken = {*found.values(), *masks.values()}
@@ -143,7 +143,8 @@ def read_frames(
         ),
     )
     absent = [frame.path for frame in frames if frame.path not in found]
-    warnings = _warnings(file, frames, absent, loose | mask_loose)
+    paths = [frame.path for frame in frames]
+    warnings = listing_warnings(file, paths, absent, loose | mask_loose)
     lost = [
         frame.mask_path
         for frame in there.values()
@@ -177,34 +178,6 @@ def _checked(
         else:
             failures.append(malformed(f"Frame {index} of {file} has no file_path."))
     return frames, failures
-
-
-def _none_there(file: str, count: int) -> CaptureError:
-    return missing(f"{file} lists {count} pictures, and none of them is in the archive.")
-
-
-def _warnings(
-    file: str, frames: Sequence[Frame], absent: Sequence[str], loose: Mapping[str, str]
-) -> list[str]:
-    warnings = []
-    if absent:
-        warnings.append(
-            f"{file} lists {len(frames)} pictures; {len(absent)} of them are not in the "
-            f"archive: {some_of(absent)}."
-        )
-    if loose:
-        path, name = min(loose.items())
-        warnings.append(
-            f"{len(loose)} paths in {file} lead nowhere in the archive and were matched by the end "
-            f'of the name, as "{shown(path)}" with "{shown(name)}".'
-        )
-    twice = [path for path, count in Counter(frame.path for frame in frames).items() if count > 1]
-    if twice:
-        warnings.append(
-            f"{file} lists {len(twice)} pictures more than once, and the first pose is taken: "
-            f"{some_of(twice)}."
-        )
-    return warnings
 
 
 @dataclass(frozen=True)

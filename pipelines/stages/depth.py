@@ -138,8 +138,8 @@ def training_images(ctx: StageContext, split: SplitConfig) -> tuple[CamerasFile,
 
 
 def _known_points(ctx: StageContext) -> NDArray[np.float64] | None:
-    path = ctx.workspace.stage("poses") / "points.ply"
-    if not ctx.workspace.is_complete("poses") or not path.is_file():
+    path = ctx.workspace.sparse_points
+    if not path.is_file():
         return None
     return np.asarray(read_ply(path).points, np.float64)
 

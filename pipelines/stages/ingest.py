@@ -1,7 +1,8 @@
 """Stage `ingest`: what was sent, checked, and its pictures and poses in our own form.
 
 Writes `capture.json` (always), `images/` (photos and app exports), `masks/`, `depth/` and
-`cameras.json` (captures with poses). A video stays where it is: `frames` reads the upload.
+`cameras.json` (captures with poses), `points.ply` (where sparse points came with those). A video
+stays where it is: `frames` reads the upload.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from pipelines.captures.record import CaptureRecord, Found
 from pipelines.captures.sniff import Sniffed, sniff
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
+from pipelines.exports.formats.ply import write_points
 from pipelines.manifest import file_sha256
 from pipelines.options import IngestOptions
 from pipelines.stage import StageContext
+from pipelines.workspace import SPARSE_POINTS
 
 
 def run(options: IngestOptions, ctx: StageContext) -> dict[str, Any]:
@@ -42,6 +45,8 @@ def run(options: IngestOptions, ctx: StageContext) -> dict[str, Any]:
     ctx.progress(0.0, "Looking at the file")
     found_kind = sniff(path, filename, ArchiveLimits(max_unpacked_bytes=options.max_unpacked_bytes))
     found = _read(found_kind, path, options, ctx)
+    if found.points is not None:
+        write_points(ctx.out / SPARSE_POINTS, found.points.places, found.points.colors)
     record = CaptureRecord(
         kind=found_kind.kind,
         filename=filename,
@@ -87,6 +92,7 @@ def _read(sniffed: Sniffed, path: Path, options: IngestOptions, ctx: StageContex
         images=found.images,
         details={**found.details, **as_details(left)},
         warnings=found.warnings + leftover_warnings(left),
+        points=found.points,
     )
 
 

@@ -30,6 +30,7 @@ from pipelines.sfm.source import Source, read_source
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import SparseModel
+from pipelines.workspace import SPARSE_POINTS
 
 MIN_TRACK = 3
 """Points seen by fewer images are left out of points.ply: most of them are wrong."""
@@ -79,7 +80,7 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     world = normalise(poses, orient=options.orientation == "auto")
     notes = {"up_from": world.up_from, "centered_on": world.centered_on}
     write_cameras(ctx.out / "cameras.json", model, source, world, notes)
-    write_sparse_points(ctx.out / "points.ply", model, world)
+    write_sparse_points(ctx.out / SPARSE_POINTS, model, world)
     report = {**build_report(outcome, source), **report_of_model(model, lenses, notes)}
     _write_report(ctx, report)
     ctx.progress(1.0, f"{len(model.indices)} of {len(source.files)} images registered", 0.0)

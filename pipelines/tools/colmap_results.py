@@ -18,20 +18,12 @@ import pycolmap
 
 from pipelines.errors import ToolError
 from pipelines.scene.cameras_file import Intrinsics
+from pipelines.scene.colmap_lenses import COLMAP_LENSES, lens_from_colmap
 
 _ANGLE_SAMPLE = 3000
 
-LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
-    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
-}
-"""The order of COLMAP's parameters (src/colmap/sensor/models.h); `f` is both focal lengths."""
+LENS_PARAMETERS = {name: lens.terms for name, lens in COLMAP_LENSES.items()}
+"""The order of COLMAP's parameters; `f` is both focal lengths."""
 
 _ONE_HOMOGRAPHY = (
     int(pycolmap.TwoViewGeometryConfiguration.PLANAR),
@@ -98,20 +90,13 @@ def intrinsics_from_colmap(
     model: str, width: int, height: int, params: Sequence[float]
 ) -> Intrinsics:
     """A COLMAP camera as ours. Raises ToolError for a lens model that we cannot express."""
-    names = LENS_PARAMETERS.get(model)
-    if names is None or len(names) != len(params):
+    try:
+        return lens_from_colmap(model, width, height, params)
+    except ValueError as error:
         raise ToolError(
-            f"COLMAP returned a camera of model {model}, which is not supported.",
-            hint=f"Choose one of {', '.join(sorted(LENS_PARAMETERS))}.",
-        )
-    values = {name: float(value) for name, value in zip(names, params, strict=True)}
-    focal = values.pop("f", None)
-    if focal is not None:
-        values |= {"fl_x": focal, "fl_y": focal}
-    ours = "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV"
-    if model.endswith("PINHOLE"):
-        ours = "PINHOLE"
-    return Intrinsics(width=width, height=height, model=ours, **values)
+            f"A camera that COLMAP returned {error}.",
+            hint=f"Choose one of {', '.join(sorted(COLMAP_LENSES))}.",
+        ) from error
 
 
 def read_statistics(database: Path, num_images: int) -> PairStatistics:

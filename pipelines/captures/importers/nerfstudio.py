@@ -45,7 +45,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         sources=listed.sources,
         failures=listed.failures,
         metric=False,
-        up_assumed=top.get(_ORIENTATION) != "none",
+        up="known" if top.get(_ORIENTATION) == "none" else "assumed",
         notes=_notes(top),
         details={
             "num_listed": len(frames),

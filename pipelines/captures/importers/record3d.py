@@ -10,14 +10,13 @@ without confidence. That of an `.r3d` (`.depth`, `.conf`) is packed with LZFSE, 
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import PurePosixPath
 from typing import Any
 
-from pipelines.captures.contents import PosedPictures, PosedSource, Rows, SensorDepth
+from pipelines.captures.contents import PosedPictures, PosedSource, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.parsing import (
     each_frame,
@@ -26,6 +25,7 @@ from pipelines.captures.parsing import (
     number,
     numbers,
     resized,
+    rotation_of,
     some_of,
     z_up_from_y_up,
 )
@@ -133,7 +133,7 @@ def _source(
 ) -> PosedSource:
     what = f"frame {n}"
     qx, qy, qz, qw, *position = numbers(poses[n], 7, f"The pose of {what}")
-    rotation = _rotation((qx, qy, qz, qw), what)
+    rotation = rotation_of((qx, qy, qz, qw), what)
     pose = tuple((*row, place) for row, place in zip(rotation, position, strict=True))
     times = metadata.get("frameTimestamps")
     timestamp = None
@@ -145,19 +145,6 @@ def _source(
         world_from_camera=z_up_from_y_up(pose),
         timestamp_s=timestamp,
         depth=None if depth is None else SensorDepth(depth, _METRE),
-    )
-
-
-def _rotation(quaternion: Sequence[float], what: str) -> Rows:
-    """The rotation of a quaternion (x, y, z, w) of any length but zero. Rows [3, 3]."""
-    length = math.sqrt(sum(value * value for value in quaternion))
-    if not 0.5 < length < 2.0:
-        raise malformed(f"The pose of {what} has no rotation.")
-    x, y, z, w = (value / length for value in quaternion)
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
 
 

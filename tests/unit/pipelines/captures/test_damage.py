@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError, PipelineError, ToolError
 from pipelines.options import IngestOptions
 from pipelines.stages.ingest import run
+from tests.sfm_writers import colmap_files, pictures_of, walked
 from tests.unit.pipelines.captures.archives import (
     context,
     nerfstudio_files,
@@ -65,7 +66,7 @@ def mutations(data: bytes, count: int, seed: int, start: int = 0) -> Iterator[by
         yield bytes(changed)
 
 
-def zipped(tmp_path: Path, files: Files, method: int = 8) -> bytes:
+def zipped(tmp_path: Path, files: Mapping[str, bytes | str], method: int = 8) -> bytes:
     return write_zip(tmp_path / "made.zip", files, method).read_bytes()
 
 
@@ -176,6 +177,34 @@ def test_damaged_pictures(tmp_path: Path, kind: str) -> None:
         for n, changed in enumerate(mutations(victim, 15, 5))
     )
     assert set(found) == {"images"}
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+@pytest.mark.parametrize("what", ["cameras", "images", "points3D"])
+def test_damaged_models_of_colmap(tmp_path: Path, form: str, what: str) -> None:
+    truth = walked(num=8)
+    files = pictures_of(truth) | colmap_files(truth, form=form)
+    name = f"sparse/0/{what}.{'bin' if form == 'binary' else 'txt'}"
+    found = Counter(
+        outcome(tmp_path / str(n), zipped(tmp_path, files | {name: changed}, 0))
+        for n, changed in enumerate(mutations(files[name], 25, 7))
+    )
+    assert set(found) <= {"colmap", "images", "poses_malformed", "poses_missing", "too_few_images"}
+
+
+@pytest.mark.parametrize("value", [0, 1 << 31, (1 << 64) - 1])
+@pytest.mark.parametrize("where", ["cameras", "images", "points3D"])
+def test_models_of_colmap_that_count_absurdly(tmp_path: Path, where: str, value: int) -> None:
+    truth = walked(num=8)
+    files = pictures_of(truth) | colmap_files(truth)
+    data = files[f"sparse/0/{where}.bin"]
+    files[f"sparse/0/{where}.bin"] = struct.pack("<Q", value) + data[8:]
+    assert outcome(tmp_path, zipped(tmp_path, files, 0)) in (
+        "colmap",
+        "images",
+        "poses_malformed",
+        "poses_missing",
+    )
 
 
 def test_damaged_videos(tmp_path: Path) -> None:
