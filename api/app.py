@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -16,24 +17,27 @@ from api import catalogue, errors, health
 from api.artifacts import endpoints as artifacts
 from api.captures import endpoints as captures
 from api.captures.receiving import sweep
-from api.deps import Services, require_key
+from api.deps import MAX_STORE_CALLS, Services, require_key
 from api.jobs import endpoints as jobs
+from api.probes import Probe
 from api.problems import Problem
 from api.settings import ApiSettings
 from storage.api_keys import ensure_api_key
+from storage.bell import Bell
 from storage.db import Database
+from storage.deletions import Drainer
 from storage.open_objects import open_object_store
-from storage.queue import Bell
 from storage.schema import upgrade
 
 VERSION = "1"
+DRAIN_S = 2.0
 logger = logging.getLogger("nerfworks.api")
 
 
 def open_services(settings: ApiSettings) -> Services:
     """Open the parts: bring the database up to date, make the first key valid, tidy up."""
     upgrade(settings.resolved_database_url)
-    database = Database(settings.resolved_database_url)
+    database = Database(settings.resolved_database_url, settings.database_timeout_s)
     key = settings.bootstrap_key()
     if key:
         with database.session_scope() as session:
@@ -43,12 +47,26 @@ def open_services(settings: ApiSettings) -> Services:
     if removed:
         logger.info("removed %d uploads that were cut short", removed)
     store = open_object_store(settings)
-    return Services(settings, database, store, Bell(settings.redis_url))
+    bell = Bell(settings.redis_url, database)
+    return Services(
+        settings,
+        database,
+        store,
+        bell,
+        Drainer(database, store),
+        (
+            Probe("database", database.ping),
+            Probe("broker", bell.ping),
+            Probe("object_store", store.ping),
+        ),
+        threading.BoundedSemaphore(MAX_STORE_CALLS),
+    )
 
 
 def close_services(services: Services) -> None:
     """Close what `open_services` opened."""
     services.bell.close()
+    services.drainer.close(DRAIN_S)
     services.database.dispose()
 
 

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from api.problems import UnauthorizedError
+from api.probes import Probe
+from api.problems import UnauthorizedError, UnavailableError
 from api.settings import ApiSettings
 from storage.api_keys import find_api_key, is_use_due, touch_api_key
+from storage.bell import Bell
 from storage.db import Database, now
+from storage.deletions import Drainer
 from storage.objects import ObjectStore
-from storage.queue import Bell
 
 MAX_KEY_CHARS = 256
+MAX_STORE_CALLS = 8
+STORE_TURN_S = 1.0
+DELETE_WAIT_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -26,9 +34,25 @@ class Services:
     database: Database
     store: ObjectStore
     bell: Bell
+    drainer: Drainer
+    probes: tuple[Probe, ...]
+    store_calls: threading.BoundedSemaphore
+    """Held by a request that waits for the object store: a store that hangs stops only so many."""
+
+    @contextmanager
+    def asking_the_store(self) -> Iterator[None]:
+        """Around a short call of the object store. Raises UnavailableError where many wait."""
+        if not self.store_calls.acquire(timeout=STORE_TURN_S):
+            raise UnavailableError(
+                "The object store does not answer.", code="object_store_unavailable"
+            )
+        try:
+            yield
+        finally:
+            self.store_calls.release()
 
 
-def get_services(request: Request) -> Services:
+async def get_services(request: Request) -> Services:
     """The parts of the running application."""
     services: Services = request.app.state.services
     return services

@@ -37,7 +37,11 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.engine import Connection
 from sqlalchemy.orm import Session, sessionmaker
 
+from storage.postgres import bound
+
 BUSY_TIMEOUT_S = 30.0
+STATEMENT_S = 15.0
+POOL_S = 10.0
 
 
 def clean_text(text: str, limit: int | None = None) -> str:
@@ -149,8 +153,10 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
 
 
-def make_engine(url: str) -> Engine:
+def make_engine(url: str, deadline_s: float = STATEMENT_S) -> Engine:
     """An engine for `sqlite:///...` or `postgresql...`; makes the folder of an SQLite file.
+
+    deadline_s: for one statement on PostgreSQL (`storage.postgres`), in seconds.
 
     A plain `postgresql://` URL is read as `postgresql+psycopg://`. Raises ValueError for others.
     """
@@ -167,20 +173,19 @@ def make_engine(url: str) -> Engine:
         return engine
     if parsed.drivername != "postgresql+psycopg":
         raise ValueError(f"no database of kind {parsed.drivername}: use sqlite or postgresql")
-    return create_engine(
-        parsed,
-        pool_pre_ping=True,
-        pool_size=5,
-        max_overflow=15,
-        connect_args={"connect_timeout": 10},
+    engine = create_engine(
+        parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_timeout=POOL_S
     )
+    bound(engine, deadline_s)
+    return engine
 
 
 class Database:
     """The records of one service. Safe to share between threads; sessions are not."""
 
-    def __init__(self, url: str) -> None:
-        self.engine = make_engine(url)
+    def __init__(self, url: str, deadline_s: float = STATEMENT_S) -> None:
+        """deadline_s: for one statement on PostgreSQL, in seconds."""
+        self.engine = make_engine(url, deadline_s)
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         self._read = sessionmaker(
             self.engine.execution_options(nerfworks_read_only=True), expire_on_commit=False

@@ -48,9 +48,12 @@ class S3ObjectStore:
     def __init__(self, settings: StorageSettings, *, bucket: str, prefix: str = "") -> None:
         self._bucket = bucket
         self._prefix = f"{prefix}/" if prefix else ""
-        self._client = _make_client(settings, settings.s3_endpoint_url)
+        endpoint, silence_s = settings.s3_endpoint_url, settings.s3_timeout_s
+        self._client = _make_client(settings, endpoint, silence_s, 4)
+        # Short calls, which people wait for: each answers or fails within seconds.
+        self._quick = _make_client(settings, endpoint, silence_s / 4, 2)
         public = settings.s3_public_endpoint_url
-        self._signer = _make_client(settings, public) if public else self._client
+        self._signer = _make_client(settings, public, silence_s, 1) if public else self._client
 
     def _full(self, key: str) -> str:
         return self._prefix + check_key(key)
@@ -93,7 +96,7 @@ class S3ObjectStore:
     def stat(self, key: str) -> ObjectStat:
         """Size and tag. Raises ObjectMissingError."""
         with _translated(key):
-            answer = self._client.head_object(Bucket=self._bucket, Key=self._full(key))
+            answer = self._quick.head_object(Bucket=self._bucket, Key=self._full(key))
         return ObjectStat(answer["ContentLength"], answer["ETag"].strip('"'))
 
     def exists(self, key: str) -> bool:
@@ -107,7 +110,7 @@ class S3ObjectStore:
     def delete(self, key: str) -> None:
         """Remove an object; nothing happens where there is none."""
         with _translated(key):
-            self._client.delete_object(Bucket=self._bucket, Key=self._full(key))
+            self._quick.delete_object(Bucket=self._bucket, Key=self._full(key))
 
     def delete_prefix(self, prefix: str) -> None:
         """Remove all objects whose keys start with `prefix`, which ends in "/"."""
@@ -125,7 +128,7 @@ class S3ObjectStore:
     def list(self, prefix: str) -> Iterator[str]:
         """The keys that start with `prefix`, which ends in "/"."""
         with _translated(prefix):
-            pages = self._client.get_paginator("list_objects_v2").paginate(
+            pages = self._quick.get_paginator("list_objects_v2").paginate(
                 Bucket=self._bucket, Prefix=self._prefix + check_prefix(prefix)
             )
             for page in pages:
@@ -151,12 +154,12 @@ class S3ObjectStore:
         """Raise ObjectStoreError where the bucket does not answer."""
         with _translated("the bucket"):
             try:
-                self._client.head_bucket(Bucket=self._bucket)
+                self._quick.head_bucket(Bucket=self._bucket)
             except ClientError as error:
                 raise ObjectStoreError(f"Bucket {self._bucket} cannot be used.") from error
 
 
-def _make_client(settings: StorageSettings, endpoint: str) -> Any:
+def _make_client(settings: StorageSettings, endpoint: str, silence_s: float, attempts: int) -> Any:
     return boto3.client(
         "s3",
         endpoint_url=endpoint or None,
@@ -166,10 +169,11 @@ def _make_client(settings: StorageSettings, endpoint: str) -> Any:
         config=Config(
             signature_version="s3v4",
             s3={"addressing_style": "path" if settings.s3_path_style else "auto"},
-            connect_timeout=5,
-            read_timeout=60,
+            connect_timeout=min(5.0, silence_s),
+            read_timeout=silence_s,
+            tcp_keepalive=True,
             max_pool_connections=20,
-            retries={"max_attempts": 5, "mode": "standard"},
+            retries={"total_max_attempts": attempts, "mode": "standard"},
             request_checksum_calculation="when_required",
             response_checksum_validation="when_required",
         ),

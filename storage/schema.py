@@ -14,12 +14,13 @@ from sqlalchemy import text
 from storage.db import make_engine
 
 _LOCK = 0x6E657266  # any number of our own: one upgrade at a time on PostgreSQL
+UPGRADE_S = 900.0  # a migration may rewrite a large table
 _MIGRATIONS = Path(__file__).parent / "migrations"
 
 
 def upgrade(database_url: str) -> None:
     """Bring the schema to the newest revision. Safe to call from several processes at once."""
-    engine = make_engine(database_url)
+    engine = make_engine(database_url, UPGRADE_S)
     try:
         with engine.begin() as connection:  # BEGIN IMMEDIATE on SQLite: others wait
             if connection.dialect.name == "postgresql":

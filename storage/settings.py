@@ -13,6 +13,8 @@ from pathlib import Path
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from storage.db import STATEMENT_S
+
 KEY_FILE = "signing.key"
 
 
@@ -26,6 +28,9 @@ class StorageSettings(BaseSettings):
 
     home: Path = Field(Path(".nerfworks"), description="Folder of all embedded state.")
     database_url: str = Field("", description="SQLAlchemy URL; empty for SQLite below home.")
+    database_timeout_s: float = Field(
+        STATEMENT_S, gt=0, description="Longest that PostgreSQL may take over one statement."
+    )
     redis_url: str = Field("redis://127.0.0.1:6379/0", description="Broker of the bell.")
     objects_url: str = Field("", description="file:///folder or s3://bucket/prefix.")
     s3_endpoint_url: str = Field("", description="S3 endpoint; empty for AWS.")
@@ -35,6 +40,9 @@ class StorageSettings(BaseSettings):
     s3_region: str = Field("us-east-1", description="S3 region.")
     s3_access_key_id: SecretStr = Field(SecretStr(""), description="Empty for the AWS defaults.")
     s3_secret_access_key: SecretStr = Field(SecretStr(""), description="Goes with the key id.")
+    s3_timeout_s: float = Field(
+        30.0, gt=0, description="Longest that S3 may be silent in a transfer; short calls get 1/4."
+    )
     s3_path_style: bool = Field(True, description="Path-style S3 addresses (most own servers).")
     secret_key: SecretStr = Field(
         SecretStr(""), description="Signs local URLs; empty for a key kept below home."

@@ -6,6 +6,7 @@ aloud, unless CI is set: there it fails.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import secrets
@@ -15,8 +16,9 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -126,6 +128,96 @@ def redis_server(tmp_path: Path) -> Iterator[RedisServer]:
     server.start()
     yield server
     server.stop()
+
+
+class Gate:
+    """A TCP port that leads to a real server, and can be made to hang: it then accepts, takes what
+    is sent, and never answers, until it is opened again. Without a server it only ever hangs."""
+
+    def __init__(self, reach: Callable[[], socket.socket] | None = None) -> None:
+        """reach: connects to the server."""
+        self._reach = reach
+        self._open = threading.Event()
+        self._ended = threading.Event()
+        self._sockets: list[socket.socket] = []
+        self._listener = socket.create_server(("127.0.0.1", 0), backlog=512)
+        self.port: int = self._listener.getsockname()[1]
+        if reach is not None:
+            self._open.set()
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def hang(self) -> None:
+        """From now on nothing is answered."""
+        self._open.clear()
+
+    def open(self) -> None:
+        """Answer again, also what was asked meanwhile."""
+        self._open.set()
+
+    def close(self) -> None:
+        """Drop everything."""
+        self._ended.set()
+        self._open.set()
+        for one in (self._listener, *self._sockets):
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+    def _accept(self) -> None:
+        while not self._ended.is_set():
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            self._sockets.append(near)
+            if self._reach is not None:
+                threading.Thread(target=self._serve, args=(near,), daemon=True).start()
+
+    def _serve(self, near: socket.socket) -> None:
+        assert self._reach is not None
+        self._open.wait()
+        with contextlib.suppress(OSError):
+            far = self._reach()
+            self._sockets.append(far)
+            threading.Thread(target=self._pass_on, args=(near, far), daemon=True).start()
+            self._pass_on(far, near)
+
+    def _pass_on(self, source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                self._open.wait()
+                target.sendall(data)
+            target.shutdown(socket.SHUT_WR)
+
+
+@pytest.fixture
+def gate() -> Iterator[Callable[..., Gate]]:
+    """Makes gates, and closes them in the end."""
+    made: list[Gate] = []
+
+    def make(reach: Callable[[], socket.socket] | None = None) -> Gate:
+        made.append(Gate(reach))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def behind_gate(url: str, gate: Callable[..., Gate]) -> tuple[str, Gate]:
+    """A PostgreSQL's URL (on a socket file) as one that leads through a gate."""
+    parsed = sa.make_url(url)
+    folder = parsed.query["host"]
+    path = f"{folder}/.s.PGSQL.{parsed.port or 5432}"
+
+    def reach() -> socket.socket:
+        far = socket.socket(socket.AF_UNIX)
+        far.connect(path)
+        return far
+
+    made = gate(reach)
+    through = parsed.set(host="127.0.0.1", port=made.port, query={"sslmode": "disable"})
+    return through.render_as_string(hide_password=False), made
 
 
 @pytest.fixture(scope="session")

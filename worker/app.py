@@ -43,6 +43,7 @@ def make_app(settings: StorageSettings) -> Celery:
             "visibility_timeout": DAY_S,
             "socket_keepalive": True,
             "socket_connect_timeout": 4.0,
+            "socket_timeout": 10.0,  # longer than kombu's blocking pop, which ends each second
             "health_check_interval": 15,
         },
     )

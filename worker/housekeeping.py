@@ -1,4 +1,4 @@
-"""The guarded loop in every worker's parent process. No beat, no leader: each round is harmless
+"""The guarded loops in every worker's parent process. No beat, no leader: each round is harmless
 when several workers do it, because the database decides.
 
     register    refresh the worker's row: it is live, and has this
@@ -22,12 +22,12 @@ from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
 
+from storage.bell import Bell
 from storage.db import Database, now
 from storage.deletions import drain_deletions
 from storage.leases import reap_expired
 from storage.objects import ObjectStore
 from storage.queries import WaitingStage, finished_jobs, ready_unclaimed
-from storage.queue import Bell
 from worker.settings import WorkerSettings
 
 _log = logging.getLogger("nerfworks.worker")
@@ -64,7 +64,11 @@ def is_ring_due(stage: WaitingStage, moment: datetime, again_s: float) -> bool:
 
 
 class Housekeeping:
-    """One thread. A round that fails is logged; the next one comes all the same."""
+    """Two threads: one asks the database alone, so that it is on time whatever else hangs; one
+    cleans, which may wait for the object store.
+
+    A round that fails is logged; the next one comes all the same.
+    """
 
     def __init__(
         self,
@@ -82,30 +86,42 @@ class Housekeeping:
         self._bell = bell
         self._settings = settings
         self._work_dir = work_dir
-        self._register = register
-        self._offer = offer
         self._stopped = threading.Event()
-        self._cleaned_at = 0.0
-        self._thread = threading.Thread(target=self._loop, daemon=True, name="housekeeping")
+        self._threads = [
+            threading.Thread(
+                target=self._loop,
+                args=((register, self.reap, self.dispatch, offer), settings.tick_s),
+                daemon=True,
+                name="housekeeping",
+            ),
+            threading.Thread(
+                target=self._loop,
+                args=((self.clean,), settings.clean_s),
+                daemon=True,
+                name="cleaning",
+            ),
+        ]
 
     def start(self) -> None:
-        """Start the loop."""
-        self._thread.start()
+        """Start the loops."""
+        for thread in self._threads:
+            thread.start()
 
     def stop(self, timeout_s: float) -> None:
-        """End the loop after the round in progress."""
+        """End the loops after the rounds in progress, or leave them behind after `timeout_s`."""
         self._stopped.set()
-        self._thread.join(timeout_s)
+        give_up_at = time.monotonic() + timeout_s
+        for thread in self._threads:
+            thread.join(max(give_up_at - time.monotonic(), 0.0))
 
-    def _loop(self) -> None:
-        duties = (self._register, self.reap, self.dispatch, self._offer, self._clean_by_time)
+    def _loop(self, duties: tuple[Callable[[], None], ...], pause_s: float) -> None:
         while not self._stopped.is_set():
             for duty in duties:
                 try:
                     duty()
                 except Exception:  # noqa: BLE001 the loop must outlive whatever a round meets
                     _log.exception("housekeeping: %s failed", duty.__name__)
-            self._stopped.wait(self._settings.tick_s)
+            self._stopped.wait(pause_s)
 
     def reap(self) -> None:
         """Take back stages whose leases ran out."""
@@ -113,7 +129,7 @@ class Housekeeping:
             ready = reap_expired(session)
         if ready:
             _log.warning("lost their workers: %s", ", ".join(ready))
-            self._bell.ring(self._database, ready)
+            self._bell.ring(ready)
 
     def dispatch(self) -> None:
         """Ring for ready stages that nobody came for."""
@@ -123,19 +139,14 @@ class Housekeeping:
         due = [
             stage.id for stage in waiting if is_ring_due(stage, moment, self._settings.ring_again_s)
         ]
-        self._bell.ring(self._database, due)
+        self._bell.ring(due)
 
     def clean(self) -> None:
         """Drop what finished jobs left on this machine, and bytes of deleted records."""
-        drain_deletions(self._database, self._store)
         folders = list(self._work_dir.iterdir()) if self._work_dir.is_dir() else []
         if folders:
             with self._database.read_scope() as session:
                 over = finished_jobs(session, [folder.name for folder in folders])
             for name in over:
                 shutil.rmtree(self._work_dir / name, ignore_errors=True)
-
-    def _clean_by_time(self) -> None:
-        if time.monotonic() - self._cleaned_at >= self._settings.clean_s:
-            self._cleaned_at = time.monotonic()
-            self.clean()
+        drain_deletions(self._database, self._store)  # last: the store may hang

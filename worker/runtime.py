@@ -18,11 +18,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from storage.bell import Bell
 from storage.db import Database
 from storage.leases import Claim, claim_stage, release_worker
 from storage.open_objects import open_object_store
 from storage.queries import WaitingStage, ready_unclaimed
-from storage.queue import QUEUE_GPU, Bell, queue_for
+from storage.queue import QUEUE_GPU, queue_for
 from storage.records import forget_worker, has_live_gpu, register_worker
 from storage.settings import StorageSettings
 from worker.compiling import KernelCompiler
@@ -82,9 +83,9 @@ class WorkerRuntime:
         self._on_unheard = on_unheard
         self.shutdown = threading.Event()
         self._settings = settings
-        self._database = Database(storage.resolved_database_url)
+        self._database = Database(storage.resolved_database_url, storage.database_timeout_s)
         self._store = open_object_store(storage)
-        self._bell = Bell(storage.redis_url)
+        self._bell = Bell(storage.redis_url, self._database)
         self._direct = ThreadPoolExecutor(identity.slots, thread_name_prefix="direct")
         self._free: queue.SimpleQueue[Runner] = queue.SimpleQueue()
         self._gpu = threading.Lock()  # held by the slot whose stage runs on the GPU
@@ -122,7 +123,7 @@ class WorkerRuntime:
             _log.warning("a former self of this worker left: %s", ", ".join(freed))
         self._register()
         self._prepare()
-        self._bell.ring(self._database, freed)
+        self._bell.ring(freed)
         self._housekeeping.start()
 
     def close(self) -> None:
@@ -154,13 +155,9 @@ class WorkerRuntime:
                         self._gpu.release()
                 taken = self._take()
                 mine = taken.claim.stage_id if taken else None
-                self._bell.ring(self._database, [key for key in ready if key != mine])
+                self._bell.ring([key for key in ready if key != mine])
         finally:
             self._free.put(runner)
-
-    def sweep(self) -> None:
-        """Delete the bytes of deleted records now."""
-        self._housekeeping.clean()
 
     def _prepare(self) -> None:
         """Start what makes the first job as fast as the second."""

@@ -1,4 +1,4 @@
-"""Celery tasks: each takes ids only and hands over to the worker's runtime."""
+"""The one Celery task: takes an id only and hands over to the worker's runtime."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from celery import shared_task
 
-from storage.queue import TASK_RUN_STAGE, TASK_SWEEP
+from storage.queue import TASK_RUN_STAGE
 from worker.runtime import current_runtime
 
 
@@ -14,9 +14,3 @@ from worker.runtime import current_runtime
 def run_stage(stage_id: str) -> Any:
     """Run a stage, if it can be claimed, and then whatever else waits for a worker like this."""
     current_runtime().serve(stage_id)
-
-
-@shared_task(name=TASK_SWEEP)  # type: ignore[untyped-decorator]
-def sweep() -> Any:
-    """One round of housekeeping now: someone deleted a record and wants its bytes gone."""
-    current_runtime().sweep()

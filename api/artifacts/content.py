@@ -6,13 +6,13 @@ from fastapi import Request
 from starlette.responses import Response, StreamingResponse
 
 from api.artifacts.ranges import etag_of, parse_range, tag_listed
+from api.deps import Services
 from storage.download_names import content_disposition
-from storage.objects import ObjectStore
 
 
 def content_response(
     request: Request,
-    store: ObjectStore,
+    services: Services,
     *,
     key: str,
     size: int,
@@ -36,7 +36,8 @@ def content_response(
     known = request.headers.get("if-none-match")
     if known is not None and tag_listed(known, etag):
         return Response(status_code=304, headers=headers)
-    store.stat(key)  # bytes that are gone must be a 404, not an answer that breaks off
+    with services.asking_the_store():
+        services.store.stat(key)  # bytes that are gone must be a 404, not an answer that breaks off
     part = parse_range(
         request.headers.get("range") if request.method == "GET" else None,
         size,
@@ -52,5 +53,8 @@ def content_response(
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=media_type)
     return StreamingResponse(
-        store.read(key, start, length), status_code=status, headers=headers, media_type=media_type
+        services.store.read(key, start, length),
+        status_code=status,
+        headers=headers,
+        media_type=media_type,
     )

@@ -58,7 +58,7 @@ def download_artifact(job_id: str, name: str, services: ServicesDep, request: Re
         )
     return content_response(
         request,
-        services.store,
+        services,
         key=found.key,
         size=found.bytes,
         tag=found.sha256,
@@ -74,10 +74,11 @@ def download_artifact(job_id: str, name: str, services: ServicesDep, request: Re
 def download_object(token: str, services: ServicesDep, request: Request) -> Response:
     """A signed, expiring URL of the local object store: needs no key."""
     signed = verify_object_token(services.settings.signing_key(), token)
-    stat = services.store.stat(signed.key)
+    with services.asking_the_store():
+        stat = services.store.stat(signed.key)
     return content_response(
         request,
-        services.store,
+        services,
         key=signed.key,
         size=stat.bytes,
         tag=stat.etag,

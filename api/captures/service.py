@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from api.captures.receiving import Received
-from api.deps import Services
+from api.deps import DELETE_WAIT_S, Services
 from pipelines.captures.sniff import sniff
 from storage import records
-from storage.deletions import drain_deletions
 from storage.keys import capture_content, capture_prefix
 from storage.models import Capture, new_id
 
@@ -42,4 +41,4 @@ def delete(services: Services, capture_id: str) -> None:
     """Delete a capture, its bytes too. Raises ConflictError while a job runs on it."""
     with services.database.session_scope() as session:
         records.delete_capture(session, capture_id)
-    drain_deletions(services.database, services.store)
+    services.drainer.drain(DELETE_WAIT_S)

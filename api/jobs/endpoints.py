@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from api.deps import ServicesDep
 from api.errors import responses
@@ -35,12 +35,11 @@ def _hint_poll(response: Response, job: JobView) -> None:
 def create_job(
     wanted: JobRequest,
     services: ServicesDep,
-    background: BackgroundTasks,
     request: Request,
     response: Response,
 ) -> JobView:
     """Make a capture into assets. The answer's `Location` is the job's address."""
-    job_id = service.create(services, wanted, background)
+    job_id = service.create(services, wanted)
     with services.database.read_scope() as session:
         job = service.view(services, session, job_id, request)
     response.headers["Location"] = f"/v1/jobs/{job_id}"

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from fastapi import BackgroundTasks, Request
+from fastapi import Request
 from sqlalchemy.orm import Session
 
 from api.artifacts import service as artifacts
-from api.deps import Services
+from api.deps import DELETE_WAIT_S, Services
 from api.jobs.schemas import JobRequest, JobView
 from api.problems import ConflictedError, FieldProblem, InvalidRequestError
 from pipelines.options import PRESETS, resolve_options, stages_skipped
 from pipelines.registry import STAGES
 from storage import jobs, queries, records
-from storage.deletions import drain_deletions
 from storage.jobs import StageSeed
 from storage.models import Job
 
@@ -51,8 +50,8 @@ def stage_seeds(preset: str, kind: str) -> list[StageSeed]:
     ]
 
 
-def create(services: Services, wanted: JobRequest, background: BackgroundTasks) -> str:
-    """Record a job; workers are told after the answer went out. Returns the job's id.
+def create(services: Services, wanted: JobRequest) -> str:
+    """Record a job, and have workers told of it. Returns the job's id.
 
     Everything is checked before anything is written. Raises NotFoundError (capture),
     InvalidRequestError (preset), OptionsError.
@@ -73,7 +72,7 @@ def create(services: Services, wanted: JobRequest, background: BackgroundTasks) 
         )
         ready = jobs.ready_stage_ids(job)
         job_id = job.id
-    background.add_task(services.bell.ring, services.database, ready)
+    services.bell.ring(ready)
     return job_id
 
 
@@ -107,4 +106,4 @@ def delete(services: Services, job_id: str) -> None:
     """Delete a job and its bytes. Raises ConflictError while it runs."""
     with services.database.session_scope() as session:
         jobs.delete_job(session, job_id)
-    drain_deletions(services.database, services.store)
+    services.drainer.drain(DELETE_WAIT_S)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from storage.bell import Bell
 from storage.db import Database
 from storage.jobs import StageSeed, create_job, ready_stage_ids, request_cancel
 from storage.keys import capture_content
@@ -19,7 +20,6 @@ from storage.models import Job, StageRow, new_id
 from storage.objects import ObjectStore
 from storage.open_objects import open_object_store
 from storage.queries import get_job
-from storage.queue import Bell
 from storage.records import create_capture, read_logs
 from storage.schema import upgrade
 from storage.settings import StorageSettings
@@ -55,7 +55,7 @@ class Engine:
         upgrade(self.settings.resolved_database_url)
         self.database = Database(self.settings.resolved_database_url)
         self.store: ObjectStore = open_object_store(self.settings)
-        self.bell = Bell(redis_url)
+        self.bell = Bell(redis_url, self.database)
         self.witness = folder / "witness.txt"
         self.witness.touch()
         self.workers: list[subprocess.Popen[bytes]] = []
@@ -119,7 +119,7 @@ class Engine:
             )
             ready = ready_stage_ids(job)
         if ring:
-            self.bell.ring(self.database, ready)
+            self.bell.ring(ready)
         return job.id
 
     def cancel(self, job_id: str) -> None:

@@ -248,7 +248,8 @@ def test_duplicate_messages_start_nothing_twice(engine: Engine) -> None:
     job_id = engine.submit({"train": {"steps": 10, "step_s": 0.1}})
     for _ in range(5):
         for stage in STAGES:
-            engine.bell.ring(engine.database, [f"{job_id}-{stage.name}"])
+            engine.bell.ring([f"{job_id}-{stage.name}"])
+        assert engine.bell.flush(10)
     engine.start_worker("w1", "--slots", "2")
     engine.start_worker("w2")
     assert engine.wait_for(job_id, "succeeded", "failed").state == "succeeded"

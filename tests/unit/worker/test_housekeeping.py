@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
+from storage.bell import Bell
 from storage.jobs import request_cancel, stage_id
 from storage.leases import cancel_stage, claim_stage
+from storage.models import PendingDeletion, StageRow
 from storage.objects_local import LocalObjectStore
+from storage.open_objects import open_object_store
 from storage.queries import WaitingStage
-from storage.queue import Bell
+from storage.settings import StorageSettings
 from tests.factories import make_database, make_job
+from tests.services import Gate
 from worker.housekeeping import Housekeeping, detect_gpu, is_ring_due
 from worker.runtime import WorkerIdentity
 from worker.settings import WorkerSettings
@@ -60,7 +65,7 @@ def test_folders_go_when_their_job_is_over_and_nothing_of_it_runs(tmp_path: Path
     keeper = Housekeeping(
         database,
         LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
-        Bell(NO_BROKER),
+        Bell(NO_BROKER, database),
         WorkerSettings(),
         work_dir=work,
         register=lambda: None,
@@ -89,7 +94,7 @@ def test_the_loop_outlives_a_round_that_fails(tmp_path: Path) -> None:
     keeper = Housekeeping(
         database,
         LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
-        Bell(NO_BROKER),
+        Bell(NO_BROKER, database),
         WorkerSettings(tick_s=0.01),
         work_dir=tmp_path / "work",
         register=register,
@@ -100,13 +105,48 @@ def test_the_loop_outlives_a_round_that_fails(tmp_path: Path) -> None:
     keeper.stop(10)
 
 
-def test_a_broker_that_is_away_is_no_error(tmp_path: Path) -> None:
+def test_reaping_is_on_time_while_broker_and_object_store_hang(
+    tmp_path: Path, gate: Callable[..., Gate]
+) -> None:
+    """Both accept and never answer. Cleaning waits for the store; nothing else waits for either."""
     database = make_database(tmp_path)
+    hung = gate().port
+    store = open_object_store(
+        StorageSettings(
+            home=tmp_path,
+            objects_url="s3://bucket/prefix",
+            s3_endpoint_url=f"http://127.0.0.1:{hung}",
+            s3_access_key_id="a",
+            s3_secret_access_key="b",
+            s3_timeout_s=60.0,
+        )
+    )
     with database.session_scope() as session:
-        job = make_job(session).id
-    begun = time.monotonic()
-    assert Bell(NO_BROKER).ring(database, [stage_id(job, "first")]) is False
-    assert time.monotonic() - begun < 10
+        session.add(PendingDeletion(prefix="jobs/gone/", created_at=T0))
+    bell = Bell(f"redis://127.0.0.1:{hung}/0", database, timeout_s=1.0)
+    settings = WorkerSettings(tick_s=0.05, clean_s=0.05)
+    work = tmp_path / "work"
+    keeper = Housekeeping(
+        database, store, bell, settings, work_dir=work, register=lambda: None, offer=lambda: None
+    )
+    keeper.start()
+    try:
+        for _ in range(3):
+            with database.session_scope() as session:
+                wanted = stage_id(make_job(session).id, "first")
+                assert claim_stage(session, wanted, "w", -1.0) is not None  # its lease is over
+            deadline = time.monotonic() + 5
+            while time.monotonic() < deadline:
+                with database.read_scope() as session:
+                    row = session.get(StageRow, wanted)
+                    if row is not None and row.state == "ready":
+                        break
+                time.sleep(0.02)
+            else:
+                pytest.fail("a lease that is over was not taken back within 5 s")
+    finally:
+        keeper.stop(0.1)
+        bell.close()
 
 
 @pytest.mark.parametrize("hidden", ["", "-1"])

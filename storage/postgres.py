@@ -1,0 +1,84 @@
+"""PostgreSQL with a deadline on everything: connecting, each statement, locks, idle transactions.
+
+The server ends statements by itself (`statement_timeout`); one that hangs, or a network that
+swallows packets, does not, so the client stops waiting too: the connection is then closed, for
+nobody knows what became of its transaction, and sqlalchemy's OperationalError says so.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from typing import Any, TypeVar
+
+import psycopg
+from psycopg import sql
+from sqlalchemy import Engine, event
+
+Result = TypeVar("Result")
+
+CONNECT_S = 5
+GRACE_S = 3.0
+"""The server's own time limit strikes so much earlier than ours."""
+KEEPALIVE: dict[str, int] = {
+    "keepalives": 1,
+    "keepalives_idle": 15,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 20_000,  # milliseconds
+}
+
+
+class BoundedConnection(psycopg.Connection[Any]):
+    """A connection that is given up when one exchange with the server takes too long."""
+
+    deadline_s = 0.0
+
+    def wait(self, gen: Generator[Any, Any, Result], *arguments: Any, **options: Any) -> Result:
+        """As psycopg's, which all statements, commits and roll-backs go through, but bounded."""
+        if not self.deadline_s:
+            return super().wait(gen, *arguments, **options)
+        return super().wait(self._bounded(gen), *arguments, **options)
+
+    def _bounded(self, gen: Generator[Any, Any, Result]) -> Generator[Any, Any, Result]:
+        """Passes everything on, also the wake-ups without news that psycopg sends each 0.1 s."""
+        give_up_at = time.monotonic() + self.deadline_s
+        try:
+            wanted = next(gen)
+            while True:
+                ready = yield wanted
+                if not ready and time.monotonic() > give_up_at:
+                    self.pgconn.finish()
+                    raise psycopg.OperationalError(
+                        f"the database gave no answer within {self.deadline_s:.0f} s; "
+                        "what became of the transaction is not known"
+                    )
+                wanted = gen.send(ready)
+        except StopIteration as end:
+            result: Result = end.value
+            return result
+
+
+def bound(engine: Engine, deadline_s: float) -> None:
+    """Have all connections of an engine bounded. deadline_s: for one statement, in seconds."""
+
+    connect_s = max(2, min(CONNECT_S, round(deadline_s)))  # libpq takes no less than 2
+
+    def connect(dialect: Any, record: Any, arguments: list[Any], options: dict[str, Any]) -> Any:
+        del dialect, record
+        given = {"connect_timeout": connect_s, **KEEPALIVE, **options}
+        connection = BoundedConnection.connect(*arguments, **given)
+        connection.deadline_s = deadline_s
+        server_s = max(deadline_s - GRACE_S, deadline_s / 2)
+        for name, seconds in (
+            ("statement_timeout", server_s),
+            ("lock_timeout", server_s / 2),
+            ("idle_in_transaction_session_timeout", 4 * deadline_s),
+        ):
+            connection.execute(
+                sql.SQL("SET {} = {}").format(sql.Identifier(name), round(1000 * seconds))
+            )
+        connection.commit()
+        return connection
+
+    event.listen(engine, "do_connect", connect)
