@@ -83,7 +83,7 @@ class TrainingError(PipelineError):
 
 class ExportError(PipelineError):
     """The trained model, or the depth maps, give no asset. Codes in use: empty_mesh,
-    empty_pointcloud, geometry_poor, no_focus."""
+    empty_pointcloud, export.empty (a crop that holds no surface), geometry_poor, no_focus."""
 
     code = "export_failed"
 

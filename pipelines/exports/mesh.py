@@ -22,6 +22,16 @@ class TriangleMesh:
     colors: Floats
     normals: Floats
 
+    def with_faces(self, faces: NDArray[np.int32]) -> TriangleMesh:
+        """Some of its faces, with the vertices that they have."""
+        kept, flat = np.unique(faces, return_inverse=True)
+        return TriangleMesh(
+            vertices=self.vertices[kept],
+            faces=flat.reshape(-1, 3).astype(np.int32),
+            colors=self.colors[kept],
+            normals=self.normals[kept],
+        )
+
 
 @dataclass(frozen=True)
 class TexturedMesh:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
@@ -60,8 +60,36 @@ class TextureOptions(StageOptions):
     )
 
 
+_World = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Side = Annotated[float, Field(gt=0, le=1e6)]
+_Degrees = Annotated[float, Field(ge=-360, le=360)]
+
+
+class CropShapeOptions(StageOptions):
+    """A part of the scene, cut out by hand, in the world of cameras.json."""
+
+    shape: Literal["none", "box", "sphere"] = Field("none", description="What is kept.")
+    center: tuple[_World, _World, _World] = Field(
+        (0.0, 0.0, 0.0), description="Its middle, x, y and z. Unit: the world's."
+    )
+    size: tuple[_Side, _Side, _Side] = Field(
+        (1.0, 1.0, 1.0), description="Sides of the box, along its own axes. Unit: the world's."
+    )
+    rotation_deg: tuple[_Degrees, _Degrees, _Degrees] = Field(
+        (0.0, 0.0, 0.0),
+        description="Turns of the box about the world's x axis, then y, then z, counter-clockwise. "
+        "Unit: degrees.",
+    )
+    radius: float = Field(1.0, gt=0, le=1e6, description="Of the sphere. Unit: the world's.")
+
+
 class CropOptions(RenderingOptions, ExtentOptions):
     """Common to mesh and point cloud."""
+
+    crop: CropShapeOptions = Field(
+        default_factory=lambda: CropShapeOptions(),
+        description="What is kept of the extent; outside of it there is nothing.",
+    )
 
     use_depth_maps: Literal["auto", "on", "off"] = Field(
         "auto",

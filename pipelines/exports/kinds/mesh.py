@@ -67,6 +67,13 @@ class MeshOptions(CropOptions, TextureOptions):
         description="The subject is simplified to this, what lies beyond to a quarter of it a "
         "shell.",
     )
+    triangles: int = Field(
+        0,
+        ge=0,
+        le=20_000_000,
+        description="Triangles of the whole mesh as it is delivered, 100000 for phones and the "
+        "web; 0 for all that max_faces leaves. Open borders stay.",
+    )
 
     @field_validator("formats")
     @classmethod
@@ -77,10 +84,16 @@ class MeshOptions(CropOptions, TextureOptions):
 
 
 def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[str, Any]:
-    """Make the mesh. Raises ExportError `empty_mesh` where the model shows no surface."""
+    """Make the mesh.
+
+    Raises ExportError `empty_mesh` where the model shows no surface, `export.empty` where there is
+    none in the crop.
+    """
     # Imported where it runs: the API reads this file too.
+    from pipelines.exports.crop import crop_of, cropped, empty_crop, narrowed, surface_in
     from pipelines.exports.mesh import TexturedMesh
-    from pipelines.exports.surface.shells import find_shells, fuse_shells
+    from pipelines.exports.reduction import reduced
+    from pipelines.exports.surface.shells import Shell, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
     from pipelines.exports.texture.bake import painted
     from pipelines.scene.depth_views import Pinhole
@@ -95,6 +108,10 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     )
     if not shells:
         raise _empty("no ray of the training views met a surface")
+    crop = crop_of(options.crop)
+    surface_in(crop, probes, shells[-1].bounds, "mesh")
+    kept = [(narrowed(shell.bounds, crop), shell.voxel) for shell in shells]
+    shells = [Shell(bounds, voxel) for bounds, voxel in kept if bounds is not None]
     images = scene.training_images(options.num_views)
     known = known_depths(ctx.workspace, options.use_depth_maps)
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
@@ -110,6 +127,12 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         )
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
+    whole, mesh = mesh, cropped(mesh, crop)
+    if crop is not None and len(mesh.faces) == 0:
+        raise empty_crop(crop, whole.vertices, "mesh")
+    if options.triangles:
+        ctx.progress(_FUSE_SHARE, f"reducing {len(mesh.faces)} triangles")
+        mesh = reduced(mesh, options.triangles)
     shown = scene.training_images()
     skin = painted(
         mesh,

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _MAX_VIEWS = 48
 _RENDER_SHARE = 0.75
+_LEAST_SHARE = 0.05
+"""Of a crop's upright box, if hardly any surface in it is in the crop."""
 
 
 class PointcloudOptions(CropOptions):
@@ -34,8 +36,13 @@ class PointcloudOptions(CropOptions):
 
 
 def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> dict[str, Any]:
-    """Make the cloud. Raises ExportError `empty_pointcloud` where no surface is in the crop."""
+    """Make the cloud.
+
+    Raises ExportError `empty_pointcloud` where the model shows no surface, `export.empty` where
+    there is none in the crop.
+    """
     # Imported where it runs: the API reads this file too.
+    from pipelines.exports.crop import crop_of, empty_crop, narrowed, surface_in
     from pipelines.exports.formats import ply
     from pipelines.exports.surface import cloud as clouds
     from pipelines.exports.surface.views import (
@@ -52,14 +59,22 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     bounds = scene.bounds(reach_of(options), ctx.check_cancelled, probes)
     if subject is None or bounds is None:
         raise _empty("no ray of the training views met a surface")
+    crop = crop_of(options.crop)
+    around = surface_in(crop, probes, bounds, "pointcloud")
+    bounds = narrowed(bounds, crop) or bounds
     images = scene.training_images(_MAX_VIEWS)
     pixels = pixels_for_points(options.num_points, len(images), probes, bounds)
+    if crop is not None:
+        reached = crop.contains(around[bounds.contains(around)])
+        pixels /= max(float(reached.mean()) if len(reached) else 0.0, _LEAST_SHARE)
     lenses = [lens_of_pixels(scene.lens_of(image), pixels) for image in images]
     known = known_depths(ctx.workspace, options.use_depth_maps)
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
         store = render_views(scene, images, lenses, Path(folder), ctx, _RENDER_SHARE, known)
         ctx.progress(_RENDER_SHARE, "gathering points")
         cloud = clouds.gather(store, bounds)
+        if crop is not None:
+            cloud = cloud.take(crop.contains(cloud.points))
         ctx.progress(0.8, f"checking {len(cloud)} points against all views")
         cloud = cloud.take(consistent(cloud.points, store))
     if options.remove_outliers:
@@ -67,8 +82,10 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         inner = subject.contains(cloud.points)
         parts = [cloud.take(inner), cloud.take(~inner)]  # what is far is spread more widely
         cloud = clouds.joined([clouds.without_outliers(part, bounds.focus) for part in parts])
+    if len(cloud) == 0 and crop is not None:
+        raise empty_crop(crop, around, "pointcloud")
     if len(cloud) == 0:
-        raise _empty("no surface lies within the crop")
+        raise _empty("no surface lies within max_distance that views agree on")
     cloud = clouds.thinned(cloud, options.num_points, ctx.seed)
     ctx.progress(0.92, "estimating normals")
     normals = clouds.oriented_normals(cloud, bounds.focus)

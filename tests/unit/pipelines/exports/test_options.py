@@ -55,6 +55,11 @@ def test_wrong_values_are_refused_with_their_path(wrong: dict[str, object]) -> N
         ("mesh", {"formats": []}, "at least 1"),
         ("mesh", {"formats": ["glb", "fbx"]}, "'glb', 'ply', 'obj', 'stl' or 'usdz'"),
         ("mesh", {"up_axis": "x"}, "'z' or 'y'"),
+        ("mesh", {"triangles": -1}, "greater than or equal to 0"),
+        ("mesh", {"crop": {"shape": "box", "size": [1.0, 0.0, 1.0]}}, "greater than 0"),
+        ("mesh", {"crop": {"shape": "box", "rotation_deg": [0, 0, 400]}}, "or equal to 360"),
+        ("pointcloud", {"crop": {"shape": "sphere", "radius": 0}}, "greater than 0"),
+        ("pointcloud", {"crop": {"shape": "cone"}}, "'none', 'box' or 'sphere'"),
     ],
 )
 def test_wrong_requests_are_refused_with_the_range(

@@ -57,6 +57,18 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
         assert ("keeps the colours of its vertices" in caplog.text) == full
 
 
+def test_the_mesh_has_the_triangles_asked_for_painted_all_the_same(job: Workspace) -> None:
+    before = tiny_job.run(job, "mesh")["summary"]
+    full = read_ply(job.stage("mesh") / "mesh.ply")
+    after = tiny_job.run(job, "mesh", triangles=before["num_faces"] // 3)["summary"]
+    assert after["num_faces"] == pytest.approx(before["num_faces"] / 3, rel=0.05)
+    few = read_ply(job.stage("mesh") / "mesh.ply")
+    painted = read_mesh(job.stage("mesh") / "mesh.glb")
+    assert isinstance(painted, TexturedMesh)
+    assert len(painted.faces) == len(few.faces) == after["num_faces"]
+    assert np.abs(few.points.max(0) - full.points.max(0)).max() < before["voxel"]
+
+
 def _lie_within(points: np.ndarray, bounds: dict[str, Any]) -> None:
     low, high = (np.asarray(bounds[key]) for key in ("box_min", "box_max"))
     assert np.all(points >= low - 1e-3)

@@ -1,0 +1,101 @@
+"""A mesh of fewer triangles, by quadric decimation, before it is painted: no seam is torn.
+
+Each piece of the mesh gives up the same share of its triangles: across all of them the coarse
+triangles of what is far would count for more than the fine ones of the subject. Open borders stay
+exactly as they are, as far as the triangles suffice for them. (Open3D's decimation is not used: its
+`boundary_weight`, as of 0.20, does not hold borders.)
+
+Source: Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", 1997, as
+pyfqmr does it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import open3d
+import pyfqmr
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pipelines.exports.mesh import Floats, TriangleMesh
+from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
+from pipelines.exports.surface.shells import joined
+
+_LEAST_PIECE = 200
+"""Faces; what is smaller is reduced together with its like."""
+_OVERSHOOT = 1.02
+
+# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
+_core: Any = open3d.core
+_tensor_geometry: Any = open3d.t.geometry
+
+
+def reduced(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
+    """The mesh with so many triangles; one that has no more stays as it is.
+
+    A few more remain where no edge can be taken away without turning a triangle over.
+    """
+    total = len(mesh.faces)
+    if total <= triangles:
+        return mesh
+    piece = _pieces(mesh)
+    shares = np.floor(np.bincount(piece) * (triangles / total)).astype(int)
+    parts = [
+        _fewer(mesh.with_faces(mesh.faces[piece == index]), int(share))
+        for index, share in enumerate(shares)
+    ]
+    return joined([part for part in parts if len(part.faces)])
+
+
+def _fewer(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
+    """One piece with so many triangles, its colours where they were."""
+    origin = mesh.vertices.mean(axis=0)
+    # The errors that pyfqmr allows, more with each round, are those of a mesh of size 1.
+    size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))) or 1.0
+    local = (mesh.vertices - origin) / size
+    for keep_borders in (True, False):
+        program = pyfqmr.Simplify()
+        program.setMesh(local, mesh.faces)
+        program.simplify_mesh(triangles, preserve_border=keep_borders, verbose=False)
+        vertices, faces, _ = program.getMesh()
+        if len(faces) <= _OVERSHOOT * triangles:
+            break
+    faces = np.asarray(faces, np.int32).reshape(-1, 3)
+    vertices = np.asarray(vertices, np.float64)
+    made = TriangleMesh(
+        vertices * size + origin, faces, _colors_at(mesh, local, vertices), np.zeros_like(vertices)
+    )
+    return from_open3d(to_open3d(made, origin), origin)
+
+
+def _colors_at(mesh: TriangleMesh, local: Floats, points: Floats) -> Floats:
+    """[P, 3] the colours of a mesh, its vertices at `local`, where it is nearest to points."""
+    scene = _tensor_geometry.RaycastingScene()
+    scene.add_triangles(
+        _core.Tensor(np.ascontiguousarray(local, np.float32)),
+        _core.Tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+    )
+    found = scene.compute_closest_points(_core.Tensor(points.astype(np.float32)))
+    u, v = found["primitive_uvs"].numpy().astype(np.float64).T
+    corners = mesh.colors[mesh.faces[found["primitive_ids"].numpy().astype(np.int64)]]
+    weights = np.stack([1.0 - u - v, u, v], axis=1)
+    colors: Floats = np.einsum("nk,nkc->nc", weights, corners)
+    return colors
+
+
+def _pieces(mesh: TriangleMesh) -> NDArray[np.int64]:
+    """[F] the piece of each face, from 0: connected ones, and all small ones together."""
+    corners = mesh.faces.reshape(-1)
+    following = mesh.faces[:, [1, 2, 0]].reshape(-1)
+    count = len(mesh.vertices)
+    links = coo_array((np.ones(len(corners), np.int8), (corners, following)), (count, count))
+    _, of_vertex = connected_components(links, directed=False)
+    of_face = of_vertex[mesh.faces[:, 0]]
+    small = np.bincount(of_face) < _LEAST_PIECE
+    piece: NDArray[np.int64] = np.unique(
+        np.where(small[of_face], -1, of_face), return_inverse=True
+    )[1]
+    return piece
