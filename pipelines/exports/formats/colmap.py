@@ -2,8 +2,9 @@
 
 COLMAP turns the world into the camera (cam_from_world), its cameras look along +Z with +Y down, and
 its quaternions are (w, x, y, z). Pixel coordinates are ours: the centre of the top-left pixel is
-(0.5, 0.5). Names are relative to the folder `images/` that belongs beside `sparse/`. There are no
-points: the poses are those that training corrected, and no sparse point was found with them.
+(0.5, 0.5). Names are relative to the folder `images/` that belongs beside `sparse/`. Points are
+those of the cloud, if any, and no image's keypoints: the poses are those that training corrected,
+and no sparse point was found with them.
 
 Source: colmap.github.io/format.html, src/colmap/sensor/models.h.
 """
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ExportError
+from pipelines.exports.formats.archive import entry
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics
 from pipelines.scene.rotations import quaternions
 
@@ -37,7 +39,16 @@ _MODELS = {
 """COLMAP's model: its number, and its terms behind (fl_x, fl_y, cx, cy)."""
 _NO_DENOMINATOR = (0.0, 0.0, 0.0)
 """k4, k5 and k6 of FULL_OPENCV divide; our k4 is the eighth power's."""
-_EPOCH = (1980, 1, 1, 0, 0, 0)
+_POINT = np.dtype(
+    [
+        ("id", "<u8"),
+        ("xyz", "<f8", (3,)),
+        ("rgb", "u1", (3,)),
+        ("error", "<f8"),
+        ("num_seen", "<u8"),
+    ]
+)
+"""Of points3D.bin; how many images saw it, by their keypoints, is none."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,7 @@ class _Image:
 
 
 def write_colmap(path: Path, cameras: CamerasFile) -> None:
-    """Write the zip. Raises ExportError for a lens that COLMAP has no model for."""
+    """Write the zip, without points. Raises ExportError for a lens that COLMAP has no model for."""
     lenses = [_camera(lens) for lens in cameras.cameras]
     images = _images(cameras)
     files = {
@@ -71,12 +82,37 @@ def write_colmap(path: Path, cameras: CamerasFile) -> None:
         "images.bin": _images_binary(images),
         "points3D.bin": struct.pack("<Q", 0),
     }
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    _write(path, files)
+
+
+def write_colmap_points(
+    path: Path, cameras: CamerasFile, points: Floats, colors: NDArray[np.uint8]
+) -> None:
+    """Write the zip with points and no text, which would be long.
+
+    points: [P, 3] world. colors: [P, 3], sRGB. Raises ExportError as `check_lenses`.
+    """
+    records = np.zeros(len(points), _POINT)
+    records["id"] = np.arange(1, len(points) + 1)
+    records["xyz"], records["rgb"] = points, colors
+    files = {
+        "cameras.bin": _cameras_binary([_camera(lens) for lens in cameras.cameras]),
+        "images.bin": _images_binary(_images(cameras)),
+        "points3D.bin": struct.pack("<Q", len(points)) + records.tobytes(),
+    }
+    _write(path, files)
+
+
+def check_lenses(cameras: CamerasFile) -> None:
+    """Raises ExportError (format_cannot_hold) for a lens that COLMAP has no model for."""
+    for lens in cameras.cameras:
+        _camera(lens)
+
+
+def _write(path: Path, files: dict[str, bytes]) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
         for name, data in files.items():
-            # A fixed time: the same cameras give the same bytes.
-            archive.writestr(
-                zipfile.ZipInfo(f"{_FOLDER}/{name}", _EPOCH), data, zipfile.ZIP_DEFLATED
-            )
+            archive.writestr(entry(f"{_FOLDER}/{name}"), data)
 
 
 def _camera(lens: Intrinsics) -> _Camera:

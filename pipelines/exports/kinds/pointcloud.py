@@ -1,6 +1,7 @@
-"""The point cloud: points with colour and normals from the depth of training views, as PLY.
+"""The point cloud: points with colour and normals from the depth of training views.
 
-In the world frame of cameras.json. Views are spread over the capture and just large enough for the
+In the world frame of cameras.json, in the formats asked for. Normals point to the cameras that saw
+the points. Views are spread over the capture and just large enough for the
 points wanted, so the work is known beforehand and an empty crop ends in an error instead of a
 search without end.
 """
@@ -8,10 +9,11 @@ search without end.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipelines.errors import ExportError
 from pipelines.exports.export import Export
@@ -20,6 +22,11 @@ from pipelines.exports.options import CropOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pipelines.exports.surface.cloud import Cloud
+    from pipelines.scene.cameras_file import CamerasFile
     from pipelines.scene.trained_scene import TrainedScene
 
 _MAX_VIEWS = 48
@@ -28,11 +35,43 @@ _LEAST_SHARE = 0.05
 """Of a crop's upright box, if hardly any surface in it is in the crop."""
 
 
+Format = Literal["ply", "las", "laz", "xyz", "colmap"]
+
+_FILES: dict[Format, str] = {
+    "ply": "pointcloud.ply",
+    "las": "pointcloud.las",
+    "laz": "pointcloud.laz",
+    "xyz": "pointcloud.xyz",
+    "colmap": "pointcloud.colmap.zip",
+}
+
+
 class PointcloudOptions(CropOptions):
     """The point cloud."""
 
+    formats: tuple[Format, ...] = Field(
+        ("ply",),
+        min_length=1,
+        max_length=5,
+        description="Files that are written: ply, las, laz, xyz (text), colmap (a model with the "
+        "points and the cameras). ply must be among them: the job's assessment looks at it.",
+    )
     num_points: int = Field(1_000_000, ge=1000, le=50_000_000, description="Points wanted.")
+    spacing: float = Field(
+        0.0,
+        ge=0,
+        le=1e6,
+        description="One point is kept of each cube with this side, before num_points are picked; "
+        "0 for all. Unit: the world's.",
+    )
     remove_outliers: bool = Field(True, description="Drop points far from their neighbours.")
+
+    @field_validator("formats")
+    @classmethod
+    def _each_once_and_ply(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:
+        if "ply" not in formats:
+            raise ValueError("must have ply among them")
+        return tuple(dict.fromkeys(formats))
 
 
 def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> dict[str, Any]:
@@ -43,7 +82,8 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     """
     # Imported where it runs: the API reads this file too.
     from pipelines.exports.crop import crop_of, empty_crop, narrowed, surface_in
-    from pipelines.exports.formats import ply
+    from pipelines.exports.formats.colmap import check_lenses
+    from pipelines.exports.spacing import one_of_each_cube
     from pipelines.exports.surface import cloud as clouds
     from pipelines.exports.surface.views import (
         known_depths,
@@ -53,6 +93,8 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     )
     from pipelines.scene.consistency import consistent
 
+    if "colmap" in options.formats:
+        check_lenses(scene.cameras)
     ctx.progress(0.0, "looking for the scene's bounds")
     probes = scene.probe_views(ctx.check_cancelled)
     subject = scene.bounds(options.max_distance, ctx.check_cancelled, probes)
@@ -86,13 +128,43 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         raise empty_crop(crop, around, "pointcloud")
     if len(cloud) == 0:
         raise _empty("no surface lies within max_distance that views agree on")
+    if options.spacing:
+        cloud = cloud.take(one_of_each_cube(cloud.points, options.spacing))
     cloud = clouds.thinned(cloud, options.num_points, ctx.seed)
     ctx.progress(0.92, "estimating normals")
     normals = clouds.oriented_normals(cloud, bounds.focus)
     ctx.progress(0.97, "writing")
-    frame = Frame(metric=scene.cameras.metric)
-    ply.write_points(ctx.out / "pointcloud.ply", cloud.points, cloud.colors, normals, frame)
-    return {"num_points": len(cloud), "num_views": len(images), "bounds": bounds.as_dict()}
+    _write(cloud, normals, options, ctx, scene.cameras)
+    return {
+        "formats": list(options.formats),
+        "num_points": len(cloud),
+        "num_views": len(images),
+        "bounds": bounds.as_dict(),
+    }
+
+
+def _write(
+    cloud: Cloud,
+    normals: NDArray[np.float64],
+    options: PointcloudOptions,
+    ctx: StageContext,
+    cameras: CamerasFile,
+) -> None:
+    """The files. normals: [P, 3]."""
+    from pipelines.exports.formats import las, ply, xyz
+    from pipelines.exports.formats.colmap import write_colmap_points
+
+    content = (cloud.points, cloud.colors, normals, Frame(metric=cameras.metric))
+    writers: dict[Format, Callable[[Path], None]] = {
+        "ply": lambda path: ply.write_points(path, *content),
+        "las": lambda path: las.write_points(path, *content),
+        "laz": lambda path: las.write_points(path, *content),
+        "xyz": lambda path: xyz.write_points(path, *content),
+        "colmap": lambda path: write_colmap_points(path, cameras, cloud.points, cloud.colors),
+    }
+    for name in options.formats:
+        ctx.check_cancelled()
+        writers[name](ctx.out / _FILES[name])
 
 
 def _empty(why: str) -> ExportError:
@@ -115,6 +187,14 @@ EXPORT = Export(
             "pointcloud.ply",
             "application/octet-stream",
             "MeshLab, CloudCompare, Blender",
+        ),
+        Artifact("pointcloud.las", "pointcloud.las", "application/vnd.las", "CloudCompare, QGIS"),
+        Artifact(
+            "pointcloud.laz", "pointcloud.laz", "application/vnd.laszip", "CloudCompare, QGIS"
+        ),
+        Artifact("pointcloud.xyz", "pointcloud.xyz", "text/plain", "CloudCompare, spreadsheets"),
+        Artifact(
+            "pointcloud.colmap.zip", "pointcloud.colmap.zip", "application/zip", "COLMAP, gsplat"
         ),
     ),
 )

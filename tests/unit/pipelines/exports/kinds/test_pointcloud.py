@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import zipfile
+from pathlib import Path
+
+import laspy
 import numpy as np
+import pycolmap
 import pytest
 
 from pipelines.errors import ExportError
 from pipelines.exports.formats.ply import read_ply
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -28,3 +34,39 @@ def test_an_empty_crop_is_an_error_and_not_an_endless_search(job: Workspace) -> 
     with pytest.raises(ExportError) as caught:
         tiny_job.run(job, "pointcloud", max_distance=1e-6)
     assert caught.value.code == "empty_pointcloud"
+
+
+def test_all_formats_hold_the_same_points(job: Workspace, tmp_path: Path) -> None:
+    formats = ("ply", "las", "laz", "xyz", "colmap")
+    summary = tiny_job.run(job, "pointcloud", formats=formats)["summary"]
+    folder = job.stage("pointcloud")
+    wanted = read_ply(folder / "pointcloud.ply")
+    assert wanted.colors is not None
+    for name in ("pointcloud.las", "pointcloud.laz"):
+        np.testing.assert_allclose(laspy.read(folder / name).xyz, wanted.points, atol=1e-5)
+    rows = np.loadtxt(folder / "pointcloud.xyz")
+    np.testing.assert_allclose(rows[:, :3], wanted.points, atol=1e-5)
+    with zipfile.ZipFile(folder / "pointcloud.colmap.zip") as archive:
+        archive.extractall(tmp_path)
+    model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    assert model.num_points3D() == summary["num_points"] == len(wanted.points)
+    points = [model.points3D[index + 1] for index in range(len(wanted.points))]
+    np.testing.assert_allclose([point.xyz for point in points], wanted.points, atol=1e-5)
+    np.testing.assert_array_equal([point.color for point in points], wanted.colors)
+    assert model.num_images() == tiny_job.NUM_IMAGES
+
+
+def test_points_keep_the_spacing_asked_for_and_face_the_cameras(job: Workspace) -> None:
+    tiny_job.run(job, "pointcloud")
+    dense = read_ply(job.stage("pointcloud") / "pointcloud.ply").points
+    spacing = 0.02 * float(np.ptp(dense, axis=0).max())
+    tiny_job.run(job, "pointcloud", spacing=spacing)
+    cloud = read_ply(job.stage("pointcloud") / "pointcloud.ply")
+    assert 50 < len(cloud.points) < 0.7 * len(dense)
+    steps = np.floor((cloud.points - cloud.points.min(0)) / spacing)
+    assert len(np.unique(steps, axis=0)) > 0.9 * len(steps)
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    eyes = np.asarray([image.world_from_camera for image in cameras.images])[:, :, 3]
+    assert cloud.normals is not None
+    towards = np.einsum("pc,pec->pe", cloud.normals, eyes[None] - cloud.points[:, None])
+    assert (towards > 0).any(axis=1).mean() > 0.99, "some camera is in front of each point"
