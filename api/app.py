@@ -113,11 +113,17 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     app.state.settings = settings
-    errors.install(app, max_body_bytes=settings.max_body_bytes, upload_path=captures.PATH)
-    keyed = [Depends(require_key)]
-    for router in (captures.router, jobs.router, artifacts.router, catalogue.router):
-        app.include_router(router, dependencies=keyed)
-    for router in (artifacts.signed_router, health.router, catalogue.page_router):
+    keyed = (captures.router, jobs.router, artifacts.router, catalogue.router)
+    others = (artifacts.signed_router, health.router, catalogue.page_router)
+    errors.install(
+        app,
+        max_body_bytes=settings.max_body_bytes,
+        upload_path=captures.PATH,
+        routes=[*app.routes, *(route for one in (*keyed, *others) for route in one.routes)],
+    )
+    for router in keyed:
+        app.include_router(router, dependencies=[Depends(require_key)])
+    for router in others:
         app.include_router(router)
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     return app

@@ -7,6 +7,7 @@ same shape. Tracebacks go to the log with the request id, never into an answer.
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import re
 import secrets
@@ -17,12 +18,14 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy.exc import DataError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from api.methods import HeadOfGet, allowed_methods
 from api.problems import (
     ApiError,
     ConflictedError,
@@ -51,6 +54,8 @@ logger = logging.getLogger("nerfworks.api")
 
 access = logging.getLogger("nerfworks.access")
 
+MAX_FIELD_PROBLEMS = 50
+MAX_LISTED = 5
 PROBLEM_TYPE = "application/problem+json"
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _QUIET_PATHS = frozenset({"/livez", "/readyz"})
@@ -78,6 +83,15 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
+class _ProblemResponse(JSONResponse):
+    """JSON of what a caller may have sent, so of text that is no Unicode, too."""
+
+    def render(self, content: Any) -> bytes:
+        """The bytes."""
+        text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
+        return text.encode("utf-8", "replace")
+
+
 def problem_response(request_path: str, error: ApiError) -> JSONResponse:
     """The answer for an error."""
     problem = Problem(
@@ -88,9 +102,9 @@ def problem_response(request_path: str, error: ApiError) -> JSONResponse:
         instance=request_path,
         code=error.code,
         hint=error.hint,
-        errors=error.errors,
+        errors=error.errors[:MAX_FIELD_PROBLEMS],
     )
-    return JSONResponse(
+    return _ProblemResponse(
         problem.model_dump(),
         status_code=error.status,
         headers={**error.headers, "Cache-Control": "no-store"},
@@ -107,12 +121,20 @@ def _of_pipeline(error: PipelineError) -> ApiError:
     return ApiError(error.message, code=error.code, hint=error.hint, status=status)
 
 
+def _listed(problems: list[FieldProblem]) -> str:
+    """The first few in one sentence; `errors` of the answer has more."""
+    shown = "; ".join(f"{problem.path}: {problem.detail}" for problem in problems[:MAX_LISTED])
+    more = len(problems) - MAX_LISTED
+    return f"{shown}; and {more} more" if more > 0 else shown
+
+
 def _of_options(error: OptionsError) -> ApiError:
+    problems = [FieldProblem(path=path, detail=detail) for path, detail in error.errors]
     return InvalidRequestError(
-        f"The options are not valid: {error}.",
+        f"The options are not valid: {_listed(problems)}.",
         code="options_invalid",
         hint="GET /v1/options lists every option with its range and meaning.",
-        errors=[FieldProblem(path=path, detail=detail) for path, detail in error.errors],
+        errors=problems,
     )
 
 
@@ -121,8 +143,7 @@ def _of_validation(error: RequestValidationError) -> ApiError:
         FieldProblem(path=".".join(str(part) for part in item["loc"]), detail=str(item["msg"]))
         for item in error.errors()
     ]
-    listed = "; ".join(f"{problem.path}: {problem.detail}" for problem in problems)
-    return InvalidRequestError(f"The request is not valid: {listed}.", errors=problems)
+    return InvalidRequestError(f"The request is not valid: {_listed(problems)}.", errors=problems)
 
 
 def _of_framework(error: HTTPException) -> ApiError:
@@ -133,7 +154,7 @@ def _of_framework(error: HTTPException) -> ApiError:
         code=code or HTTPStatus(error.status_code).name.lower(),
         hint=hint,
         status=error.status_code,
-        headers=dict(error.headers or {}),
+        headers={name: text for name, text in (error.headers or {}).items() if name != "Allow"},
     )
 
 
@@ -179,6 +200,8 @@ def to_api_error(error: Exception) -> ApiError:
         return _of_storage(error)
     if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError):
         return UnavailableError("The database does not answer.", code="database_unavailable")
+    if isinstance(error, DataError | UnicodeEncodeError):
+        return InvalidRequestError("The request holds text or a number that cannot be stored.")
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return NoSpaceError("The service's disk is full.")
     return ApiError("The service failed on this request.")
@@ -186,6 +209,10 @@ def to_api_error(error: Exception) -> ApiError:
 
 async def _handle(request: Request, error: Exception) -> Response:
     answer = to_api_error(error)
+    if answer.status == 405:
+        answer.headers["Allow"] = ", ".join(
+            allowed_methods(request.app.state.known_routes, request.scope)
+        )
     if answer.status >= 500:
         logger.error("%s %r: %s", request.method, request.url.path, answer.code, exc_info=error)
     return problem_response(request.url.path, answer)
@@ -264,8 +291,10 @@ class BodyLimit:
         await self.app(scope, receive_bounded, send)
 
 
-def install(app: FastAPI, *, max_body_bytes: int, upload_path: str) -> None:
-    """Register the handlers and the guards."""
+def install(
+    app: FastAPI, *, max_body_bytes: int, upload_path: str, routes: list[BaseRoute]
+) -> None:
+    """Register the handlers and the guards. routes: all that the application answers."""
     handler: Callable[[Request, Any], Awaitable[Response]] = _handle
     for kind in (
         ApiError,
@@ -277,8 +306,12 @@ def install(app: FastAPI, *, max_body_bytes: int, upload_path: str) -> None:
         OperationalError,
         InterfaceError,
         PoolTimeoutError,
+        DataError,
+        UnicodeEncodeError,
         OSError,
     ):
         app.add_exception_handler(kind, handler)
+    app.state.known_routes = routes
+    app.add_middleware(HeadOfGet, routes=routes)
     app.add_middleware(BodyLimit, max_bytes=max_body_bytes, upload_path=upload_path)
     app.add_middleware(RequestGuard)

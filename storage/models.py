@@ -6,6 +6,7 @@ that every later write of that claim must show.
 
 from __future__ import annotations
 
+import re
 import secrets
 import time
 from datetime import datetime
@@ -27,11 +28,17 @@ from storage.db import CleanJson, CleanText, UtcDateTime
 
 _BIG = BigInteger().with_variant(Integer(), "sqlite")  # only INTEGER counts up by itself there
 ID_LENGTH = 28
+_ID = re.compile(rf"[0-9a-f]{{{ID_LENGTH}}}", re.ASCII)
 
 
 def new_id() -> str:
     """A random id that sorts by time: 12 hex digits of milliseconds, 16 of chance."""
     return f"{int(time.time() * 1000):012x}{secrets.token_hex(8)}"
+
+
+def is_id(text: str) -> bool:
+    """Whether a text has the form of such an id; every other one names nothing."""
+    return _ID.fullmatch(text) is not None
 
 
 class Base(DeclarativeBase):

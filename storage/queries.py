@@ -6,7 +6,7 @@ import base64
 import binascii
 import json
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
 from sqlalchemy import Select, and_, func, or_, select, tuple_
@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, joinedload, selectinload, undefer
 from storage.db import now
 from storage.errors import InvalidCursorError, NotFoundError
 from storage.leases import Claim
-from storage.models import Capture, Event, Job, StageRow
+from storage.models import Capture, Event, Job, StageRow, is_id
 from storage.states import JOB_STATES
 
 MAX_PAGE = 200
@@ -67,9 +67,10 @@ def decode_cursor(cursor: str) -> tuple[datetime, str]:
         raw = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
         created_at, record_id = json.loads(raw)
         moment = datetime.fromisoformat(created_at)
-        if moment.tzinfo is None or not isinstance(record_id, str):
+        if moment.tzinfo is None or not is_id(record_id):
             raise ValueError("a cursor holds an aware time and an id")
-    except (ValueError, TypeError, binascii.Error) as error:
+        moment = moment.astimezone(UTC)
+    except (ValueError, TypeError, OverflowError, RecursionError, binascii.Error) as error:
         raise InvalidCursorError("The cursor is not one that this service gave out.") from error
     return moment, record_id
 

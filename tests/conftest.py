@@ -14,6 +14,20 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-from tests.services import gate, postgres_server, postgres_url, redis_server, s3_endpoint
+from tests.services import (
+    gate,
+    postgres_module_url,
+    postgres_server,
+    postgres_url,
+    redis_server,
+    s3_endpoint,
+)
 
-__all__ = ["gate", "postgres_server", "postgres_url", "redis_server", "s3_endpoint"]
+__all__ = [
+    "gate",
+    "postgres_module_url",
+    "postgres_server",
+    "postgres_url",
+    "redis_server",
+    "s3_endpoint",
+]

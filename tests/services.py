@@ -234,12 +234,12 @@ def postgres_server() -> Iterator[Any]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-@pytest.fixture
-def postgres_url(postgres_server: Any) -> Iterator[str]:
-    """The URL of an empty database of the test's own."""
+@contextlib.contextmanager
+def fresh_database(server: Any) -> Iterator[str]:
+    """The URL of an empty database, dropped in the end."""
     name = f"test_{secrets.token_hex(6)}"
     admin = sa.create_engine(
-        sa.make_url(postgres_server.get_uri()).set(drivername="postgresql+psycopg"),
+        sa.make_url(server.get_uri()).set(drivername="postgresql+psycopg"),
         isolation_level="AUTOCOMMIT",
     )
     with admin.connect() as connection:
@@ -249,6 +249,20 @@ def postgres_url(postgres_server: Any) -> Iterator[str]:
     with admin.connect() as connection:
         connection.execute(sa.text(f"DROP DATABASE {name} WITH (FORCE)"))
     admin.dispose()
+
+
+@pytest.fixture
+def postgres_url(postgres_server: Any) -> Iterator[str]:
+    """The URL of an empty database of the test's own."""
+    with fresh_database(postgres_server) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def postgres_module_url(postgres_server: Any) -> Iterator[str]:
+    """The URL of an empty database for the tests of one file."""
+    with fresh_database(postgres_server) as url:
+        yield url
 
 
 @dataclass(frozen=True)

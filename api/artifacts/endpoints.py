@@ -12,6 +12,7 @@ from api.artifacts.content import content_response
 from api.artifacts.schemas import ArtifactList
 from api.deps import ServicesDep
 from api.errors import responses
+from api.ids import JobId
 from storage import queries
 from storage.objects_local import LocalObjectStore
 from storage.signed_urls import verify_object_token
@@ -28,7 +29,7 @@ _CONTENT: dict[int | str, dict[str, Any]] = {
 
 
 @router.get("", responses=responses(404))
-def list_artifacts(job_id: str, services: ServicesDep, request: Request) -> ArtifactList:
+def list_artifacts(job_id: JobId, services: ServicesDep, request: Request) -> ArtifactList:
     """What the job offers for download."""
     with services.database.read_scope() as session:
         job = queries.get_job(session, job_id, manifests=True)
@@ -45,7 +46,9 @@ def list_artifacts(job_id: str, services: ServicesDep, request: Request) -> Arti
         307: {"description": "The bytes are at this signed URL."},
     },
 )
-def download_artifact(job_id: str, name: str, services: ServicesDep, request: Request) -> Response:
+def download_artifact(
+    job_id: JobId, name: str, services: ServicesDep, request: Request
+) -> Response:
     """The bytes (`Range`, `ETag`), or a redirect to a signed URL of the object store."""
     with services.database.read_scope() as session:
         found = service.find(queries.get_job(session, job_id, manifests=True), name)

@@ -13,6 +13,7 @@ from api.captures.receiving import Body, Limits, receive, staging_file
 from api.captures.schemas import CapturePage, CaptureView
 from api.deps import ServicesDep
 from api.errors import responses
+from api.ids import CaptureId
 from api.problems import ApiError
 from storage import queries, records
 
@@ -83,13 +84,13 @@ def list_captures(
 
 
 @router.get("/{capture_id}", responses=responses(404))
-def get_capture(capture_id: str, services: ServicesDep) -> CaptureView:
+def get_capture(capture_id: CaptureId, services: ServicesDep) -> CaptureView:
     """One capture."""
     with services.database.read_scope() as session:
         return CaptureView.of(records.get_capture(session, capture_id))
 
 
 @router.delete("/{capture_id}", status_code=204, responses=responses(404, 409))
-def delete_capture(capture_id: str, services: ServicesDep) -> None:
+def delete_capture(capture_id: CaptureId, services: ServicesDep) -> None:
     """Delete a capture and its bytes. Finished jobs keep their results."""
     service.delete(services, capture_id)

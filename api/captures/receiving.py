@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import fcntl
 import hashlib
+import re
 import secrets
 import shutil
 from collections.abc import AsyncIterator, Iterator
@@ -53,7 +54,7 @@ class Limits:
 
     def check_length(self, content_length: str | None) -> int:
         """The announced length, 0 if none. Raises TooLargeError for one that cannot fit."""
-        if content_length is None or not content_length.isdigit():
+        if content_length is None or not re.fullmatch(r"[0-9]{1,18}", content_length):
             return 0
         length = int(content_length)
         if length > self.max_bytes + FRAMING_BYTES:

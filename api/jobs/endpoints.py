@@ -8,6 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from api.deps import ServicesDep
 from api.errors import responses
+from api.ids import JobId, LabelFilter
 from api.jobs import service
 from api.jobs.schemas import (
     JobPage,
@@ -51,9 +52,7 @@ def create_job(
 def list_jobs(
     services: ServicesDep,
     state: Annotated[JobState | None, Query()] = None,
-    label: Annotated[
-        str | None, Query(max_length=400, description="KEY (has it) or KEY=VALUE.")
-    ] = None,
+    label: Annotated[LabelFilter | None, Query(description="KEY (has it) or KEY=VALUE.")] = None,
     limit: Annotated[int, Query(ge=1, le=100)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> JobPage:
@@ -66,7 +65,7 @@ def list_jobs(
 
 
 @router.get("/{job_id}", responses=responses(404))
-def get_job(job_id: str, services: ServicesDep, request: Request, response: Response) -> JobView:
+def get_job(job_id: JobId, services: ServicesDep, request: Request, response: Response) -> JobView:
     """One job: state, stages with progress and time left, metrics, error, artifacts."""
     with services.database.read_scope() as session:
         job = service.view(services, session, job_id, request)
@@ -75,7 +74,9 @@ def get_job(job_id: str, services: ServicesDep, request: Request, response: Resp
 
 
 @router.post("/{job_id}/cancel", status_code=202, responses=responses(404, 409))
-def cancel_job(job_id: str, services: ServicesDep, request: Request, response: Response) -> JobView:
+def cancel_job(
+    job_id: JobId, services: ServicesDep, request: Request, response: Response
+) -> JobView:
     """Ask a job to stop; asking twice changes nothing. The running stage stops within 10 s."""
     service.cancel(services, job_id)
     with services.database.read_scope() as session:
@@ -85,14 +86,14 @@ def cancel_job(job_id: str, services: ServicesDep, request: Request, response: R
 
 
 @router.delete("/{job_id}", status_code=204, responses=responses(404, 409))
-def delete_job(job_id: str, services: ServicesDep) -> None:
+def delete_job(job_id: JobId, services: ServicesDep) -> None:
     """Delete a job and its bytes."""
     service.delete(services, job_id)
 
 
 @router.get("/{job_id}/logs", responses=responses(404))
 def get_job_logs(
-    job_id: str,
+    job_id: JobId,
     services: ServicesDep,
     stage: Annotated[StageName | None, Query(description="One stage; left out: all.")] = None,
     line: Annotated[

@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field
 
 from api.artifacts.schemas import ArtifactView
+from api.ids import CaptureId, Labels
 from pipelines.registry import STAGE_NAMES
 from storage.models import Job, StageRow
 
-MAX_LABELS = 50
-_LABEL_KEY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._/-]{0,62}")
 _METRICS = ("psnr", "ssim", "lpips", "num_images", "width", "height")
 _ASSETS = ("mesh", "cloud", "depth", "depth_agreement", "warnings")
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
 StageState = Literal["blocked", "ready", "running", "succeeded", "failed", "cancelled", "skipped"]
 StageName = StrEnum("StageName", {name: name for name in STAGE_NAMES})  # type: ignore[misc]
-
-
-def _checked_labels(labels: dict[str, str]) -> dict[str, str]:
-    for key in labels:
-        if not _LABEL_KEY.fullmatch(key):
-            raise ValueError(
-                "a label's key has 1 to 63 letters, digits, dots, dashes, underscores or slashes"
-            )
-    return labels
-
-
-LabelValue = Annotated[str, StringConstraints(max_length=255)]
-Labels = Annotated[
-    dict[str, LabelValue], Field(max_length=MAX_LABELS), AfterValidator(_checked_labels)
-]
 
 
 class JobRequest(BaseModel):
@@ -55,7 +38,7 @@ class JobRequest(BaseModel):
         },
     )
 
-    capture_id: str = Field(max_length=64)
+    capture_id: CaptureId
     preset: str | None = Field(
         None, max_length=64, description="A name from /v1/presets; left out: the service chooses."
     )

@@ -127,7 +127,7 @@ def test_options_are_laid_over_the_preset(service: Service) -> None:
         ({"options": {"train": 3}}, 422, "options_invalid", ["train"]),
         ({"options": []}, 422, "request_invalid", ["body.options"]),
         ({"colour": "red"}, 422, "request_invalid", ["body.colour"]),
-        ({"labels": {"bad key!": "x"}}, 422, "request_invalid", ["body.labels"]),
+        ({"labels": {"bad key!": "x"}}, 422, "request_invalid", ["body.labels.bad key!.[key]"]),
         ({"labels": {"key": "x" * 300}}, 422, "request_invalid", ["body.labels.key"]),
         ({"capture_id": None}, 422, "request_invalid", ["body.capture_id"]),
     ],
