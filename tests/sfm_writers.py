@@ -7,14 +7,17 @@ look into them.
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pipelines.sample.film import walk
 from pipelines.sample.scene import pose_matrix
@@ -130,3 +133,98 @@ def colmap_lens(lens: Intrinsics) -> pycolmap.Camera:
         height=lens.height,
         params=[lens.fl_x, lens.fl_y, lens.cx, lens.cy, *terms],
     )
+
+
+def angle_axis(rotation: Floats) -> list[float]:
+    """The axis times the angle of a rotation [3, 3], radians."""
+    vector: list[float] = Rotation.from_matrix(rotation).as_rotvec().tolist()
+    return vector
+
+
+def opensfm_camera(lens: Intrinsics) -> dict[str, object]:
+    """A lens as OpenSfM writes it: brown or fisheye_opencv, in units of the longer side."""
+    side = max(lens.width, lens.height)
+    brown = {"k1": lens.k1, "k2": lens.k2, "k3": lens.k3, "p1": lens.p1, "p2": lens.p2}
+    fisheye = {"k1": lens.k1, "k2": lens.k2, "k3": lens.k3, "k4": lens.k4}
+    is_fisheye = lens.model == "OPENCV_FISHEYE"
+    return {
+        "projection_type": "fisheye_opencv" if is_fisheye else "brown",
+        "width": lens.width,
+        "height": lens.height,
+        "focal_x": lens.fl_x / side,
+        "focal_y": lens.fl_y / side,
+        "c_x": (lens.cx - lens.width / 2) / side,
+        "c_y": (lens.cy - lens.height / 2) / side,
+        **(fisheye if is_fisheye else brown),
+    }
+
+
+def opensfm_reconstruction(
+    truth: CamerasFile, *, gps: bool = False, images: str = "images/"
+) -> dict[str, Any]:
+    """One reconstruction, its points those of `sparse_points`."""
+    shots = {}
+    for image in truth.images:
+        rotation, translation = opencv_pose(pose_matrix(image)[:3])
+        shots[image.file.removeprefix(images)] = {
+            "rotation": angle_axis(rotation),
+            "translation": translation.tolist(),
+            "camera": f"v2 maker {image.camera}",
+            "orientation": 1,
+            "capture_time": 1286894631.0,
+            "gps_dop": 5.0 if gps else 999999.0,
+            "gps_position": [0.0, 0.0, 0.0],
+        }
+    places, colors = sparse_points()
+    return {
+        "cameras": {f"v2 maker {n}": opensfm_camera(lens) for n, lens in enumerate(truth.cameras)},
+        "shots": shots,
+        "points": {
+            str(n): {"color": color.astype(float).tolist(), "coordinates": place.tolist()}
+            for n, (place, color) in enumerate(zip(places, colors, strict=True))
+        },
+        "reference_lla": {"latitude": 48.77, "longitude": 2.3, "altitude": 80.0},
+    }
+
+
+def odm_files(truth: CamerasFile, place: Sequence[float] = (449_123.0, 5_411_804.0, 80.0)) -> Files:
+    """What OpenDroneMap leaves: cameras.json and odm_report/shots.geojson, in map coordinates."""
+    features = []
+    for image in truth.images:
+        rotation, _ = opencv_pose(pose_matrix(image)[:3])
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {
+                    "filename": image.file.rpartition("/")[2],
+                    "camera": f"v2 maker {image.camera}",
+                    "rotation": angle_axis(rotation),
+                    "translation": (pose_matrix(image)[:3, 3] + place).tolist(),
+                },
+                "geometry": {"type": "Point", "coordinates": [2.3, 48.77, 80.0]},
+            }
+        )
+    cameras = {f"v2 maker {n}": opensfm_camera(lens) for n, lens in enumerate(truth.cameras)}
+    collection = {"type": "FeatureCollection", "features": features}
+    return {
+        "cameras.json": json.dumps(cameras).encode(),
+        "odm_report/shots.geojson": json.dumps(collection).encode(),
+    }
+
+
+def nvm_text(truth: CamerasFile, *, r: float = 0.0, images: str = "") -> str:
+    """A model as VisualSFM writes it; the truth's lenses have one focal length and nothing else."""
+    lines = ["NVM_V3 ", "", str(len(truth.images))]
+    for image in truth.images:
+        pose = pose_matrix(image)[:3]
+        x, y, z, w = Rotation.from_matrix(opencv_pose(pose)[0]).as_quat()
+        focal = truth.cameras[image.camera].fl_x
+        numbers = [focal, w, x, y, z, *pose[:, 3], r]
+        name = image.file.removeprefix(images)
+        lines.append(f"{name}\t{' '.join(repr(float(value)) for value in numbers)} 0 ")
+    places, colors = sparse_points()
+    lines += ["", str(len(places))]
+    for place, color in zip(places, colors, strict=True):
+        numbers = [*map(repr, place.tolist()), *map(str, color.tolist())]
+        lines.append(" ".join(numbers) + " 3 0 5 1.5 -2.5 1 6 30.5 -2.5 2 7 1.5 -2.5")
+    return "\n".join([*lines, "", "0", "", "#the last part of NVM file", "0", "0"]) + "\n"

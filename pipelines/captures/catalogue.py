@@ -14,11 +14,13 @@ from pipelines.captures.importers import (
     blender,
     colmap,
     nerfstudio,
+    opensfm,
     photos,
     polycam,
     record3d,
     scanner_app,
     video_file,
+    visualsfm,
 )
 from pipelines.captures.unpack import CaptureArchive
 
@@ -29,7 +31,9 @@ IMPORTERS: tuple[Importer, ...] = (
     record3d.IMPORTER,
     polycam.IMPORTER,
     scanner_app.IMPORTER,
+    opensfm.IMPORTER,
     colmap.IMPORTER,
+    visualsfm.IMPORTER,
     photos.IMPORTER,
 )
 """In order of precedence: the first that claims an upload reads it. `photos` takes any picture."""

@@ -149,10 +149,10 @@ class CaptureArchive:
         self._used.add(name)
         return self.peek(name, max_bytes + 1)
 
-    def read_json(self, name: str) -> Any:
-        """One entry as JSON. Raises CaptureError poses_malformed where it is none."""
+    def read_json(self, name: str, max_bytes: int = MAX_JSON_BYTES) -> Any:
+        """One entry as JSON. Raises CaptureError as `read`; poses_malformed where it is none."""
         try:
-            return json.loads(self.read(name))
+            return json.loads(self.read(name, max_bytes))
         except (ValueError, RecursionError) as error:
             raise CaptureError(
                 f'"{shown(name)}" in the archive is not readable JSON.',

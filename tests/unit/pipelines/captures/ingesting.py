@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.errors import CaptureError
 from pipelines.options import IngestOptions
+from pipelines.sample.scene import pose_matrix
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.stage import StageContext
@@ -64,6 +65,15 @@ def sources(ctx: StageContext) -> list[str]:
     """Names in the archive of the pictures that were taken, in order."""
     record = json.loads((ctx.out / "capture.json").read_text())
     return [image["source"] for image in record["images"]]
+
+
+def assert_poses(ctx: StageContext, truth: CamerasFile, atol: float = 1e-9) -> None:
+    """Every picture has the pose that is true of it, in the world of the truth."""
+    by_file = {image.file: pose_matrix(image)[:3] for image in truth.images}
+    found = cameras(ctx).images
+    assert len(found) == len(sources(ctx)) > 0
+    for image, source in zip(found, sources(ctx), strict=True):
+        np.testing.assert_allclose(image.world_from_camera, by_file[source], atol=atol)
 
 
 def warning_with(summary: Mapping[str, Any], *words: str) -> str:

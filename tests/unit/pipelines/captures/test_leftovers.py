@@ -53,13 +53,14 @@ def test_looking_at_a_file_does_not_use_it(tmp_path: Path) -> None:
     [
         ("sparse/0/cameras.bin", b"", "COLMAP"),
         ("images.txt", b"# Image list", "COLMAP"),
-        ("opensfm/reconstruction.json", b"[]", "OpenSfM"),
+        ("opensfm/reconstruction.json", b"{}", "OpenSfM"),
         ("poses_bounds.npy", b"", "LLFF"),
         ("odometry.csv", b"timestamp, frame", "Stray Scanner"),
         ("turntable.xml", b'<?xml version="1.0" encoding="UTF-8"?>\n<document version="1.5.0">',
          "Metashape"),
         ("export.csv", b"#cameras 12\n#name,x,y,alt", "RealityCapture"),
-        ("a.nvm", b"NVM_V3", "VisualSFM"),
+        ("a.nvm", b"NVM_V2", "VisualSFM"),
+        ("cameras.sfm", b"{}", "Meshroom"),
     ],
 )  # fmt: skip
 def test_poses_of_other_programs_beside_photos_are_named(

@@ -19,11 +19,11 @@ from pipelines.sample.align import similarity
 from pipelines.sample.scene import pose_matrix
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics
 from pipelines.scene.colmap_lenses import COLMAP_LENSES, OTHER_LENSES, lens_from_colmap
-from pipelines.stage import StageContext
 from tests.sfm_writers import colmap_files, pictures_of, sparse_points, walked
 from tests.unit.pipelines.captures.archives import nerfstudio_files, picture, write_zip
 from tests.unit.pipelines.captures.ingesting import (
     Files,
+    assert_poses,
     cameras,
     code_of,
     failure,
@@ -34,15 +34,6 @@ from tests.unit.pipelines.captures.ingesting import (
 
 TRUTH = walked()
 PICTURES = pictures_of(TRUTH)
-
-
-def assert_poses(ctx: StageContext, truth: CamerasFile, atol: float = 1e-9) -> None:
-    """Every picture has the pose that is true of it, in the world of the truth."""
-    by_file = {image.file: pose_matrix(image)[:3] for image in truth.images}
-    found = cameras(ctx).images
-    assert len(found) == len(sources(ctx)) > 0
-    for image, source in zip(found, sources(ctx), strict=True):
-        np.testing.assert_allclose(image.world_from_camera, by_file[source], atol=atol)
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])
