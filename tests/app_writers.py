@@ -6,6 +6,7 @@ importer should find, whose names are those in the archive.
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from dataclasses import replace
@@ -45,6 +46,20 @@ def breathing(truth: CamerasFile) -> CamerasFile:
     )
     images = tuple(replace(image, camera=index) for index, image in enumerate(truth.images))
     return replace(truth, cameras=lenses, images=images)
+
+
+def opencv_matrix(pose: Floats) -> Floats:
+    """world_from_camera [4, 4] of the OpenCV camera that an OpenGL one [3, 4] is."""
+    matrix = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+    matrix[:, 1:3] *= -1.0
+    return matrix
+
+
+def numbers(rows: Floats) -> str:
+    """Rows of numbers as text, as numpy writes them."""
+    stream = io.StringIO()
+    np.savetxt(stream, np.atleast_2d(rows))
+    return stream.getvalue()
 
 
 def _projection(lens: Intrinsics) -> list[float]:
@@ -97,3 +112,123 @@ def write_scanner_app(path: Path, num: int = 5, width: int = 160, step: int = 3)
         archive.writestr("All_Data/info.json", json.dumps({"appVersionString": "1.9.7"}))
         archive.writestr("All_Data/thumb_00000.jpg", jpeg(shown(truth, truth.images[0])[::4, ::4]))
     return truth
+
+
+def _k(lens: Intrinsics) -> Floats:
+    """A lens as OpenCV's matrix [3, 3], pixel centres at integers."""
+    return np.array([[lens.fl_x, 0, lens.cx - 0.5], [0, lens.fl_y, lens.cy - 0.5], [0, 0, 1]])
+
+
+def _padded(matrix: Floats) -> Floats:
+    padded = np.eye(4)
+    padded[: len(matrix), : len(matrix)] = matrix
+    return padded
+
+
+def write_seven_scenes(path: Path, num: int = 5, width: int = 160) -> CamerasFile:
+    """The layout of 7-Scenes with 3DMatch's file of intrinsics, shared by several sequences."""
+    truth = walk(num, landscape_camera(width))
+    (lens,) = truth.cameras
+    names = {index: f"scene/seq-01/frame-{index:06d}.color.png" for index in range(num)}
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("scene/camera-intrinsics.txt", numbers(_k(lens)))
+        for image, name in zip(truth.images, names.values(), strict=True):
+            stem, pose = name.removesuffix(".color.png"), pose_matrix(image)
+            archive.writestr(name, png(shown(truth, image)))
+            counts = counts_of(reduced(lens, 2), pose, 5.0)
+            archive.writestr(f"{stem}.depth.png", png(np.where(counts, counts, np.uint16(65535))))
+            archive.writestr(f"{stem}.pose.txt", numbers(opencv_matrix(pose)))
+    return named(truth, names)
+
+
+def write_scannet(path: Path, num: int = 6, width: int = 160, lost: int = 2) -> CamerasFile:
+    """A ScanNet scene as its own reader unpacks it; the camera had lost its way in one frame."""
+    truth = walk(num, landscape_camera(width))
+    (lens,) = truth.cameras
+    small = reduced(lens, 2)
+    names = {index: f"scene0000_00/color/{index * 20}.jpg" for index in range(num)}
+    with zipfile.ZipFile(path, "w") as archive:
+        for kind, each in (("color", lens), ("depth", small)):
+            file = f"scene0000_00/intrinsic/intrinsic_{kind}.txt"
+            archive.writestr(file, numbers(_padded(_k(each))))
+            file = f"scene0000_00/intrinsic/extrinsic_{kind}.txt"
+            archive.writestr(file, numbers(np.eye(4)))
+        for index, image in enumerate(truth.images):
+            pose, n = pose_matrix(image), index * 20
+            matrix = np.full((4, 4), -np.inf) if index == lost else opencv_matrix(pose)
+            archive.writestr(names[index], jpeg(shown(truth, image)))
+            archive.writestr(f"scene0000_00/depth/{n}.png", png(counts_of(small, pose, 5.0)))
+            archive.writestr(f"scene0000_00/pose/{n}.txt", numbers(matrix))
+    del names[lost]
+    return named(truth, names)
+
+
+def write_replica(path: Path, num: int = 11, width: int = 240) -> CamerasFile:
+    """Replica as NICE-SLAM publishes it: names without gaps, 6553.5 counts to a metre."""
+    scale = 6553.5
+    truth = walk(num, landscape_camera(width))
+    (lens,) = truth.cameras
+    names = {index: f"Replica/room0/results/frame{index:06d}.jpg" for index in range(num)}
+    k = _k(lens)
+    camera = {"w": lens.width, "h": lens.height, "fx": k[0, 0], "fy": k[1, 1]}
+    camera |= {"cx": k[0, 2], "cy": k[1, 2], "scale": scale}
+    poses = [pose_matrix(image) for image in truth.images]
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("Replica/cam_params.json", json.dumps({"camera": camera}))
+        rows = np.array([opencv_matrix(pose).ravel() for pose in poses])
+        archive.writestr("Replica/room0/traj.txt", numbers(rows))
+        for index, image in enumerate(truth.images):
+            z = depth_image(reduced(lens, 4), poses[index])
+            counts = np.round(np.where(z < 9.0, z, 0.0) * scale).astype(np.uint16)
+            archive.writestr(names[index], jpeg(shown(truth, image)))
+            archive.writestr(f"Replica/room0/results/depth{index:06d}.png", png(counts))
+    return named(truth, names)
+
+
+def write_rgbd_list(path: Path, num: int = 11, width: int = 240) -> CamerasFile:
+    """A list of poses for pictures whose names count without zeros: `rgb_0` ... `rgb_10`."""
+    truth = walk(num, landscape_camera(width))
+    (lens,) = truth.cameras
+    names = {index: f"rgb/rgb_{index}.png" for index in range(num)}
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("K.txt", numbers(_k(lens)))
+        rows = [opencv_matrix(pose_matrix(image)).ravel() for image in truth.images]
+        archive.writestr("traj_w_c.txt", numbers(np.array(rows)))
+        for index, image in enumerate(truth.images):
+            archive.writestr(names[index], png(shown(truth, image)))
+            counts = counts_of(reduced(lens, 4), pose_matrix(image))
+            archive.writestr(f"depth/depth_{index}.png", png(counts))
+    return named(truth, names)
+
+
+def write_llff(
+    path: Path, num: int = 11, width: int = 240, shift: int = 0, as_text: bool = True
+) -> CamerasFile:
+    """`poses_bounds.npy` and pictures of twice the stated size, their names not padded.
+
+    as_text: rows follow the names as text, as the format's own program writes them; else they
+    follow the numbers. shift: rows that are this many pictures late, as where a picture was added.
+    """
+    height = width * 3 // 4
+    focal = 0.8 * width
+    lens = Intrinsics(width, height, focal, focal, width / 2, height / 2)
+    truth = replace(walk(num, lens), metric=False)
+    names = {index: f"kitchen/images/IMG_7_{index}.jpg" for index in range(num)}
+    rows = {}
+    for index, image in enumerate(truth.images):
+        pose = pose_matrix(image)
+        table = np.column_stack(
+            [-pose[:, 1], pose[:, 0], pose[:, 2], pose[:, 3], [height * 2, width * 2, focal * 2]]
+        )
+        rows[names[index]] = [*table.ravel(), 0.4, 9.0]
+    order = sorted(rows) if as_text else list(rows)
+    stream = io.BytesIO()
+    np.save(stream, np.roll([rows[name] for name in order], shift, axis=0))
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("kitchen/poses_bounds.npy", stream.getvalue())
+        for index, image in enumerate(truth.images):
+            picture = shown(truth, image)
+            archive.writestr(names[index], jpeg(picture))
+            file = names[index].replace("images", "images_4").replace("jpg", "png")
+            archive.writestr(file, png(picture[::4, ::4]))
+    return named(truth, names)

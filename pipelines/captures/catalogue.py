@@ -13,11 +13,13 @@ from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.importers import (
     blender,
     colmap,
+    llff,
     nerfstudio,
     opensfm,
     photos,
     polycam,
     record3d,
+    rgbd,
     scanner_app,
     video_file,
     visualsfm,
@@ -34,6 +36,8 @@ IMPORTERS: tuple[Importer, ...] = (
     opensfm.IMPORTER,
     colmap.IMPORTER,
     visualsfm.IMPORTER,
+    llff.IMPORTER,
+    rgbd.IMPORTER,
     photos.IMPORTER,
 )
 """In order of precedence: the first that claims an upload reads it. `photos` takes any picture."""

@@ -85,11 +85,26 @@ class SparsePoints:
 
 
 @dataclass(frozen=True)
+class Reading:
+    """One way in which poses that name no picture may belong to the pictures.
+
+    rule: how it pairs them, as the end of "the poses belong to the pictures ...". is_plain: whether
+    it is the only one that comes to mind, to be believed also where the pictures cannot tell.
+    """
+
+    rule: str
+    sources: Sequence[PosedSource]
+    is_plain: bool
+
+
+@dataclass(frozen=True)
 class PosedPictures:
     """A capture that brings its poses.
 
-    sources: in the order of the capture. failures: why frames beside those cannot be used, one
-    error for each; few are passed over, many fail the capture.
+    sources: in the order of the capture. readings: where the files do not say which pose is which
+    picture's, the ways in which they may; the pictures then say which of them is right
+    (`pipelines.captures.pose_order`), and `sources` is that one's. failures: why frames beside
+    those cannot be used, one error for each; few are passed over, many fail the capture.
     up: see `Up`. metric: whether the world's unit is the metre. points: in the same world, or None.
     is_dense: whether neighbours are so alike that a long capture may be thinned. notes: about the
     world, for `cameras.json`. details, warnings: for the record.
@@ -97,6 +112,7 @@ class PosedPictures:
 
     sources: Sequence[PosedSource]
     metric: bool
+    readings: Sequence[Reading] = ()
     failures: Sequence[CaptureError] = ()
     is_dense: bool = False
     up: Up = "known"

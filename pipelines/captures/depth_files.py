@@ -1,8 +1,8 @@
 """Depth that a phone's sensor measured, out of an archive: decoded, checked, in world units.
 
 Read are pictures of one channel and 16 bits in PNG, and the R channel of OpenEXR (Record3D's), and
-nothing else. What is not finite, not above 0 or not trusted becomes 0, unknown. A map that cannot
-be used never costs its picture: it is left out and told.
+nothing else. What is not finite, not above 0, not trusted or at the end of what 16 bits can count
+becomes 0, unknown. A map that cannot be used never costs its picture: it is left out and told.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class DepthWriter:
             )
         with np.errstate(over="ignore", invalid="ignore"):
             z = (values.astype(np.float64) * depth.unit).astype(np.float32)
-            known = np.isfinite(z) & (z > 0)
+            known = np.isfinite(z) & (z > 0) & ~_at_its_end(values)
         if depth.confidence is not None:
             known &= self._confidence(depth.confidence, values.shape) >= depth.least_confidence
         if not known.any():
@@ -129,6 +129,14 @@ class DepthWriter:
             if image.mode not in _ONE_CHANNEL:
                 raise _unusable(name, f"has colours ({image.mode}) in place of one channel")
             return np.asarray(image)
+
+
+def _at_its_end(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where counts are the largest that their type has: nothing was measured, or more than fits."""
+    if values.dtype.kind != "u":
+        return np.zeros(values.shape, bool)
+    ends: NDArray[np.bool_] = values == np.iinfo(values.dtype).max
+    return ends
 
 
 def _exr_channel(path: Path, name: str, max_pixels: int) -> NDArray[Any]:

@@ -97,20 +97,28 @@ def pose_of_opencv(camera_from_world: Rows, translation: Sequence[float]) -> Row
     )
 
 
+def opengl_camera(rows: Rows) -> Rows:
+    """A pose of an OpenCV camera (+Y down, looks along +Z), of the OpenGL camera that it is."""
+    return tuple((x, -y, -z, place) for x, y, z, place in rows)
+
+
 def each_frame(
     archive: CaptureArchive,
     frames: Mapping[str, Frame],
-    parse: Callable[[str, Frame], PosedSource],
+    parse: Callable[[str, Frame], PosedSource | None],
 ) -> tuple[list[PosedSource], list[CaptureError]]:
     """What `parse` makes of each frame, and the errors of those that it cannot use.
 
-    frames: what is known of each picture, by its name in the archive.
+    frames: what is known of each picture, by its name in the archive. What `parse` returns None for
+    is no frame, and nothing is told.
     """
     sources: list[PosedSource] = []
     failures: list[CaptureError] = []
     for name, frame in frames.items():
         try:
-            sources.append(parse(name, frame))
+            source = parse(name, frame)
+            if source is not None:
+                sources.append(source)
         except CaptureError as error:
             if error.code not in FRAME_FAULTS:
                 raise

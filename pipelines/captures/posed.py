@@ -17,6 +17,7 @@ from pipelines.captures.depth_files import DepthWriter
 from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.captures.parsing import malformed
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
+from pipelines.captures.pose_order import proven
 from pipelines.captures.record import Found, FoundPoints
 from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
@@ -54,9 +55,11 @@ def write_posed(
 
     source: what `cameras.json` says the poses came from.
     Frames that cannot be used are left out where they are few; depth that cannot be used costs no
-    frame. Raises CaptureError as
-    `storing.store_each` does, with the code of the frames' own errors where they are many.
+    frame. Raises CaptureError as `pose_order.proven` and
+    `storing.store_each` do, with the code of the frames' own errors where they are many.
     """
+    if capture.readings:
+        capture = proven(archive, capture, options, ctx)
     sources = capture.sources
     if capture.is_dense:
         picked = evenly_picked(len(sources), options.max_posed_images)

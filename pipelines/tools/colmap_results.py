@@ -155,6 +155,34 @@ def read_features(database: Path, num_images: int, per_image: int) -> list[npt.N
     return found
 
 
+def read_matches(
+    database: Path, num_images: int
+) -> dict[tuple[int, int], tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
+    """Verified matches of pairs of indices: places in pixels in the one and the other, [M, 2] each.
+
+    Call it only while pycolmap has the database closed.
+    """
+    places: list[npt.NDArray[np.float64]] = [np.zeros((0, 2)) for _ in range(num_images)]
+    found = {}
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        index_of = {
+            image_id: image_index(name)
+            for image_id, name in connection.execute("SELECT image_id, name FROM images")
+        }
+        for image_id, rows, columns, blob in connection.execute(
+            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
+        ):
+            values = np.frombuffer(blob, np.float32).reshape(rows, columns)
+            places[index_of[image_id]] = values[:, :2].astype(np.float64)
+        for pair_id, rows, blob in connection.execute(
+            "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0"
+        ):
+            i, j = (index_of[image] for image in pycolmap.pair_id_to_image_pair(pair_id))
+            matches = np.frombuffer(blob, np.uint32).reshape(rows, 2)
+            found[i, j] = places[i][matches[:, 0]], places[j][matches[:, 1]]
+    return found
+
+
 def _centred(width: int, height: int) -> npt.NDArray[np.float64]:
     """Pixels to units of the long side from the image's centre, [3, 3]."""
     side = float(max(width, height))

@@ -49,16 +49,20 @@ _WITNESSES = ("info.json", "depth_", "conf_")
 
 def claims(listing: Listing) -> Claim | None:
     """A folder where `frame_<n>` is a picture and a JSON file, with a file of this app beside."""
-    folders = {
-        name.rpartition("/")[0]
-        for name in listing.pictures
-        if (n := _number(name, "frame_")) and f"{_folder(name)}frame_{n}.json" in listing.heads
+    witnessed = {
+        _folder(name) for name in listing.heads if name.rpartition("/")[2].startswith(_WITNESSES)
     }
-    roots = [f"{folder}/" if folder else "" for folder in folders]
-    for root in sorted(roots, key=lambda root: (root.count("/"), root)):
-        if any(name.startswith(root + file) for name in listing.heads for file in _WITNESSES):
-            return Claim(root, "frame_<n>.json beside frame_<n>.jpg")
-    return None
+    roots = {
+        folder
+        for name in listing.pictures
+        if (folder := _folder(name)) in witnessed
+        and (n := _number(name, "frame_"))
+        and f"{folder}frame_{n}.json" in listing.heads
+    }
+    if not roots:
+        return None
+    root = min(roots, key=lambda root: (root.count("/"), root))
+    return Claim(root, "frame_<n>.json beside frame_<n>.jpg")
 
 
 def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:

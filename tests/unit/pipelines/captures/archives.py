@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import PIL.Image
+from numpy.typing import NDArray
 from PIL.TiffImagePlugin import IFDRational
 
 from pipelines.stage import StageContext
@@ -180,3 +181,61 @@ def scanner_app_files(count: int = 5, step: int = 3, **frame: Any) -> dict[str, 
         if n % step == 0:
             files[f"All_Data/frame_{n:05d}.jpg"] = picture(seed=n)
     return files
+
+
+def rows_of(values: Any) -> str:
+    """Numbers [r, c] as text."""
+    return "\n".join(" ".join(str(float(value)) for value in row) for row in values) + "\n"
+
+
+K = [[60.0, 0.0, 31.0], [0.0, 61.0, 23.0], [0.0, 0.0, 1.0]]
+
+
+def rgbd_files(count: int = 5, layout: str = "folder") -> dict[str, bytes | str]:
+    """An RGB-D capture: camera n is at (n, 0.5, -2), its depth 1 m and n cm.
+
+    layout: "beside" (7-Scenes), "folder" (ScanNet) or "list" (K.txt and poses.txt).
+    """
+    files: dict[str, bytes | str] = {}
+    for n in range(count):
+        stem = f"{n:06d}"
+        color, depth, text = {
+            "beside": (
+                f"frame-{stem}.color.png",
+                f"frame-{stem}.depth.png",
+                f"frame-{stem}.pose.txt",
+            ),
+            "folder": (f"color/{n}.png", f"depth/{n}.png", f"pose/{n}.txt"),
+            "list": (f"images/{stem}.png", f"depth/{stem}.png", ""),
+        }[layout]
+        files[color] = picture(seed=n, kind="PNG")
+        files[depth] = depth_png(np.full((12, 16), 1000 + 10 * n, np.uint16))
+        if text:
+            files[text] = rows_of(pose(float(n), 0.5, -2.0))
+    files["intrinsic/intrinsic_color.txt" if layout == "folder" else "K.txt"] = rows_of(K)
+    if layout == "list":
+        rows = [np.ravel(pose(float(n), 0.5, -2.0)) for n in range(count)]
+        files["poses.txt"] = rows_of(rows)
+    return files
+
+
+def llff_table(count: int = 5) -> NDArray[np.float64]:
+    """Rows of `poses_bounds.npy` for pictures of 64x48: camera n is at (n, 0.5, -2), unrotated."""
+    rows = np.zeros((count, 17))
+    for n in range(count):
+        table: list[list[float]] = [[0, 1, 0, n, 48], [-1, 0, 0, 0.5, 64], [0, 0, 1, -2.0, 60]]
+        rows[n] = [*(value for row in table for value in row), 1.0, 9.0]
+    return rows
+
+
+def npy(values: Any, **given: Any) -> bytes:
+    """An array as a .npy file."""
+    stream = io.BytesIO()
+    np.save(stream, np.asarray(values), **given)
+    return stream.getvalue()
+
+
+def llff_files(count: int = 5) -> dict[str, bytes | str]:
+    """An LLFF capture whose pictures have padded names."""
+    files: dict[str, bytes | str] = {"poses_bounds.npy": npy(llff_table(count))}
+    return files | {f"images/{n:03d}.jpg": picture(seed=n) for n in range(count)}

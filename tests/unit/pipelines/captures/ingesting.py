@@ -56,6 +56,16 @@ def cameras(ctx: StageContext) -> CamerasFile:
     return CamerasFile.load(ctx.out / "cameras.json")
 
 
+def poses_as_sent(ctx: StageContext) -> NDArray[np.float64]:
+    """The poses that the stage wrote, [N, 3, 4], in the world that they came in."""
+    file = cameras(ctx)
+    applied = np.array(file.notes.get("applied_transform", np.eye(3, 4).tolist()))
+    poses = np.array([image.world_from_camera for image in file.images])
+    poses[:, :, 3] -= applied[:, 3]
+    sent: NDArray[np.float64] = applied[:, :3].T @ poses
+    return sent
+
+
 def depth_of(ctx: StageContext, index: int) -> NDArray[np.float32]:
     """The depth that the stage wrote beside picture `index`."""
     return load_sensor_depth(ctx.out / str(cameras(ctx).images[index].depth))

@@ -21,10 +21,12 @@ from pipelines.stages.ingest import run
 from tests.sfm_writers import colmap_files, pictures_of, walked
 from tests.unit.pipelines.captures.archives import (
     context,
+    llff_files,
     nerfstudio_files,
     picture,
     polycam_files,
     record3d_files,
+    rgbd_files,
     scanner_app_files,
     write_zip,
 )
@@ -127,9 +129,12 @@ def test_end_record_with_a_wrong_number(tmp_path: Path, field: int, more: int) -
         (record3d_files, "EXR_RGBD/metadata.json"),
         (polycam_files, "keyframes/corrected_cameras/1500000.json"),
         (lambda: scanner_app_files(4, 1), "All_Data/frame_00002.json"),
+        (lambda: rgbd_files(4), "pose/2.txt"),
+        (lambda: rgbd_files(4), "intrinsic/intrinsic_color.txt"),
+        (lambda: rgbd_files(4, "list"), "poses.txt"),
     ],
 )
-def test_damaged_json(tmp_path: Path, make: Callable[[], Files], name: str) -> None:
+def test_damaged_text(tmp_path: Path, make: Callable[[], Files], name: str) -> None:
     files = make()
     text = str(files[name])
     rng = random.Random(name)
@@ -141,6 +146,16 @@ def test_damaged_json(tmp_path: Path, make: Callable[[], Files], name: str) -> N
         changed = text[:where] + piece + text[where + rng.randint(0, 12) :]
         data = zipped(tmp_path, files | {name: changed}, 0)
         assert outcome(tmp_path / str(n), data)
+
+
+def test_damaged_arrays(tmp_path: Path) -> None:
+    files = llff_files(4)
+    whole = files["poses_bounds.npy"]
+    assert isinstance(whole, bytes)
+    for n, changed in enumerate(mutations(whole, 40, 7)):
+        assert outcome(
+            tmp_path / str(n), zipped(tmp_path, files | {"poses_bounds.npy": changed}, 0)
+        )
 
 
 @pytest.mark.parametrize("value", ["null", "[]", "{}", '"x"', "true", "1e400", "[[[1]]]", "-1"])

@@ -154,6 +154,52 @@ def test_office_keeps_the_depth_of_its_sensor(tmp_path: Path) -> None:
     assert 0.59 < np.median(known) < 0.78
 
 
+def test_office_by_its_list_of_poses_is_the_same_office(tmp_path: Path) -> None:
+    """`poses.txt`, `K.txt`: OpenCV cameras, metres. Half of the pictures, rows cut to match."""
+    folder = captures() / "rgbd-hololens-office"
+    every = sorted((folder / "images").iterdir())[::2]
+    files = {f"scan/images/{path.name}": path.read_bytes() for path in every}
+    for path in every:
+        files[f"scan/depth/{path.name}"] = (folder / "depth" / path.name).read_bytes()
+    rows = (folder / "poses.txt").read_text().splitlines()[::2]
+    files |= {"scan/poses.txt": "\n".join(rows).encode()}
+    files |= {"scan/K.txt": (folder / "K.txt").read_bytes()}
+    workspace, summary = prepared(tmp_path, write_zip(tmp_path / "office.zip", files, 0))
+    found = (summary["kind"], summary["num_images"], summary["num_depths"], summary["metric"])
+    assert found == ("rgbd", 47, 47, True)
+    assert max(summary["epipolar_error"].values()) < 0.0015
+    file = CamerasFile.load(workspace.posed_cameras)
+    assert file.notes["up"] == "+Y"
+    assert disagreement(file, workspace.images_root, 1) < 0.006
+    listed = json.loads((folder / "transforms.json").read_text())["frames"]
+    poses = {frame["file_path"]: frame["transform_matrix"] for frame in listed}
+    turn = np.array(file.notes["applied_transform"])[:, :3]
+    for image, path in zip(file.images, every, strict=True):
+        expected = turn @ np.array(poses[f"images/{path.name}"])[:3]
+        np.testing.assert_allclose(image.world_from_camera, expected, atol=1e-4)
+
+
+def test_juice_box_has_its_poses_in_the_order_of_names_as_text(tmp_path: Path) -> None:
+    folder = captures() / "photos-juicebox-white-table"
+    source = zip_of(tmp_path / "box.zip", folder, [p for p in folder.rglob("*") if p.is_file()])
+    workspace, summary = prepared(tmp_path, source)
+    assert (summary["kind"], summary["num_images"], summary["metric"]) == ("llff", 64, False)
+    assert "as text" in summary["pose_order"]
+    right = summary["epipolar_error"].pop(summary["pose_order"])
+    (wrong,) = summary["epipolar_error"].values()
+    assert right < 0.0005
+    assert wrong > 0.005
+    file = CamerasFile.load(workspace.posed_cameras)
+    record = json.loads((workspace.stage("ingest") / "capture.json").read_text())
+    numbers = [int(Path(image["source"]).stem.rpartition("_")[2]) for image in record["images"]]
+    assert numbers == list(range(64))  # in the order of the film
+    # Neighbours in the film are neighbours in the room, and it was filmed upright.
+    centers = np.array([[row[3] for row in image.world_from_camera] for image in file.images])
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert steps.max() < 0.4 * np.linalg.norm(np.ptp(centers, axis=0))
+    assert np.mean([image.world_from_camera[2][1] for image in file.images]) > 0.7
+
+
 def test_door_handle_skips_the_frame_that_is_missing(tmp_path: Path) -> None:
     folder = captures() / "record3d-door-handle-first100"
     source = zip_of(tmp_path / "door.zip", folder, [p for p in folder.rglob("*") if p.is_file()])

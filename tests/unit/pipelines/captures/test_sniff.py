@@ -16,10 +16,12 @@ from pipelines.captures.archive_rules import ArchiveLimits
 from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError
 from tests.unit.pipelines.captures.archives import (
+    llff_files,
     nerfstudio_files,
     picture,
     polycam_files,
     record3d_files,
+    rgbd_files,
     scanner_app_files,
     write_zip,
 )
@@ -96,6 +98,10 @@ def test_single_photo_is_refused_with_advice_to_send_many(tmp_path: Path) -> Non
         ("polycam", polycam_files(corrected=False)),
         ("record3d", record3d_files()),
         ("3dscannerapp", scanner_app_files(2)),
+        ("llff", llff_files()),
+        ("rgbd", rgbd_files(layout="beside")),
+        ("rgbd", rgbd_files(layout="folder")),
+        ("rgbd", rgbd_files(layout="list")),
         ("images", {"b.png": picture(kind="PNG"), "sub/a.data": picture()}),
     ],
 )

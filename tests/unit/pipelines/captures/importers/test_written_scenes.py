@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,32 @@ from pipelines.options import IngestOptions
 from pipelines.sample.scene import pose_matrix
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.stages.ingest import run
-from tests.app_writers import write_scanner_app
+from tests.app_writers import (
+    write_llff,
+    write_replica,
+    write_rgbd_list,
+    write_scanner_app,
+    write_scannet,
+    write_seven_scenes,
+)
 from tests.unit.pipelines.captures.archives import context
 from tests.unit.pipelines.captures.depth_agreement import disagreement
 
 Write = Callable[..., CamerasFile]
 
 
-@pytest.mark.parametrize(("kind", "write"), [("3dscannerapp", write_scanner_app)])
+@pytest.mark.parametrize(
+    ("kind", "write"),
+    [
+        ("3dscannerapp", write_scanner_app),
+        ("rgbd", write_seven_scenes),
+        ("rgbd", write_scannet),
+        ("rgbd", write_replica),
+        ("rgbd", write_rgbd_list),
+        ("llff", write_llff),
+        ("llff", partial(write_llff, as_text=False)),
+    ],
+)
 def test_poses_lenses_and_depth_are_those_of_the_scene(
     tmp_path: Path, kind: str, write: Write
 ) -> None:

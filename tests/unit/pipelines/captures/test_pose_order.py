@@ -1,0 +1,75 @@
+"""Distances from epipolar lines, and the orders in which rows may belong to pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.captures.orders import AS_TEXT, COUNTED, FROM_0, FROM_1, frame_number, orders
+from pipelines.captures.pose_order import epipolar_distances
+from pipelines.sample.film import hand_held_pose, phone_camera
+from pipelines.scene.cameras_file import Intrinsics
+
+LENS = phone_camera(480)
+WIDE = Intrinsics(400, 300, 250.0, 255.0, 190.0, 160.0)
+
+
+def seen(points: np.ndarray, pose: np.ndarray, lens: Intrinsics) -> np.ndarray:
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    x = lens.fl_x * local[:, 0] / -local[:, 2] + lens.cx
+    y = -lens.fl_y * local[:, 1] / -local[:, 2] + lens.cy
+    return np.column_stack([x, y])
+
+
+def test_points_lie_on_their_lines_and_pixels_beside_them_as_far_as_they_are_moved() -> None:
+    poses = hand_held_pose(0.2), hand_held_pose(0.35)
+    points = np.random.default_rng(5).uniform(-0.3, 0.3, (50, 3))
+    places = seen(points, poses[0], LENS), seen(points, poses[1], WIDE)
+    on = epipolar_distances(poses, (LENS, WIDE), places)
+    np.testing.assert_allclose(on, 0.0, atol=1e-9)
+    # Moved by 2 px in all directions, a place leaves its line by at most that, seldom by little.
+    angles = np.linspace(0, np.pi, 50)
+    moved = places[1] + 2.0 * np.column_stack([np.cos(angles), np.sin(angles)])
+    off = epipolar_distances(poses, (LENS, WIDE), (places[0], moved))
+    assert off.max() <= 2.0
+    assert off.max() > 1.2
+    # The other way round it is the same.
+    turned = epipolar_distances(poses[::-1], (WIDE, LENS), (moved, places[0]))
+    np.testing.assert_allclose(turned, off, rtol=1e-9)
+
+
+def test_cameras_in_one_place_have_no_lines() -> None:
+    pose = hand_held_pose(0.4)
+    places = np.zeros((3, 2)), np.ones((3, 2))
+    assert np.isinf(epipolar_distances((pose, pose), (LENS, LENS), places)).all()
+
+
+@pytest.mark.parametrize(
+    ("names", "num_rows", "found"),
+    [
+        (["1.jpg", "2.jpg"], 2, {COUNTED: [0, 1]}),
+        (["9.jpg", "10.jpg"], 2, {COUNTED: [0, 1], AS_TEXT: [1, 0]}),
+        (["0.jpg", "4.jpg"], 9, {FROM_0: [0, 4]}),
+        (["4.jpg", "9.jpg"], 9, {FROM_1: [3, 8]}),
+        (["a1.jpg", "b1.jpg"], 9, {}),
+        (["a.jpg", "b.jpg"], 9, {}),
+        (["10.jpg"], 5, {}),
+        (["0.jpg", "1.jpg", "2.jpg"], 2, {FROM_0: [0, 1], FROM_1: [0, 1]}),
+        ([], 3, {}),
+    ],
+)
+def test_rows_pair_with_names(names: list[str], num_rows: int, found: dict[str, list[int]]) -> None:
+    rows = {
+        rule: [row for _, row in rows]
+        for rule, rows in orders(names, num_rows, by_number=True).items()
+    }
+    assert rows == found
+    assert not orders(names, len(names) + 1, by_number=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [("a/b12/frame-000007.color.png", 7), ("x.png", None), ("3/x.png", None), ("9" * 30, None)],
+)
+def test_the_last_number_of_a_name_counts(name: str, number: int | None) -> None:
+    assert frame_number(name) == number
