@@ -106,17 +106,24 @@ class Bell:
     def _send_all(self, stage_ids: list[str]) -> None:
         with self._database.read_scope() as session:
             rows = session.execute(
-                select(StageRow.id, StageRow.needs_gpu).where(StageRow.id.in_(stage_ids))
+                select(StageRow.id, StageRow.resource).where(StageRow.id.in_(stage_ids))
             ).all()
             gpu = has_live_gpu(session)
         sent = []
         for row in rows:
-            if not self._send(row.id, queue_for(row.needs_gpu, gpu)):
+            if not self._send(row.id, queue_for(row.resource, gpu)):
                 break
             sent.append(row.id)
         if sent:
             with self._database.session_scope() as session:
-                rung = update(StageRow).where(StageRow.id.in_(sent), StageRow.state == "ready")
+                # A row that is being claimed is passed over: waiting for it, with others of its job
+                # held, could end in a deadlock. One that is not marked is rung for again.
+                free = (
+                    select(StageRow.id)
+                    .where(StageRow.id.in_(sent), StageRow.state == "ready")
+                    .with_for_update(skip_locked=True, key_share=True)
+                )
+                rung = update(StageRow).where(StageRow.id.in_(free))
                 session.execute(rung.values(rung_at=now(session)))
 
     def _send(self, stage_id: str, queue: str) -> bool:

@@ -42,6 +42,8 @@ from storage.postgres import bound
 BUSY_TIMEOUT_S = 30.0
 STATEMENT_S = 15.0
 POOL_S = 10.0
+ACTOR = "actor"
+"""Key of `Session.info`: who changes something in this session. Events carry the name."""
 
 
 def clean_text(text: str, limit: int | None = None) -> str:
@@ -132,6 +134,11 @@ def now(session: Session) -> datetime:
     return datetime.now(UTC)
 
 
+def name_actor(session: Session, actor: str) -> None:
+    """Say who changes something in this session, unless that was said before."""
+    session.info.setdefault(ACTOR, actor)
+
+
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # we say BEGIN ourselves, see _begin_sqlite
     connection.execute(f"PRAGMA busy_timeout = {int(BUSY_TIMEOUT_S * 1000)}")
@@ -192,9 +199,14 @@ class Database:
         )
 
     @contextmanager
-    def session_scope(self) -> Iterator[Session]:
-        """A session that may write. Commits when the block ends, rolls back when it raises."""
+    def session_scope(self, actor: str | None = None) -> Iterator[Session]:
+        """A session that may write. Commits when the block ends, rolls back when it raises.
+
+        actor: who changes something, for the record.
+        """
         with self._write.begin() as session:
+            if actor is not None:
+                name_actor(session, actor)
             yield session
 
     @contextmanager

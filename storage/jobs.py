@@ -1,4 +1,5 @@
-"""A job's life: create, cancel, delete. `storage.leases` has what workers do to its stages.
+"""A job's life: create, cancel, delete. `storage.claims` and `storage.leases` have what workers
+do to its stages.
 
 Callers commit, and ring the bell (`storage.queue`) for stages that became ready after the commit.
 Reading is in `storage.queries`. `when` is for tests; it defaults to the database's clock.
@@ -17,7 +18,8 @@ from sqlalchemy.orm import Session
 from storage.db import now
 from storage.errors import ConflictError, NotFoundError
 from storage.keys import job_prefix
-from storage.models import Capture, Event, Job, LogLine, PendingDeletion, StageRow, new_id
+from storage.models import Capture, Event, Job, LogLine, PendingDeletion, StageRow, StageRun, new_id
+from storage.queue import resource_of
 from storage.transitions import drop_waiting, lock_job, record_event, set_job, settle
 
 MAX_ATTEMPTS = 3
@@ -38,20 +40,25 @@ def stage_id(job_id: str, name: str) -> str:
     return f"{job_id}-{name}"
 
 
-def _stage_rows(job_id: str, stages: Sequence[StageSeed], max_attempts: int) -> list[StageRow]:
+def queue_key(created_at: datetime, job_id: str, seq: int) -> str:
+    """Sorts stages that wait: the oldest job first, of a job the earliest stage."""
+    return f"{int(created_at.timestamp() * 1000):012x}{job_id}{seq:04d}"
+
+
+def _stage_rows(job: Job, stages: Sequence[StageSeed], max_attempts: int) -> list[StageRow]:
     return [
         StageRow(
-            id=stage_id(job_id, stage.name),
-            job_id=job_id,
+            id=stage_id(job.id, stage.name),
+            job_id=job.id,
             name=stage.name,
             seq=position,
             after=list(stage.after),
             state="skipped" if stage.skipped else "blocked",
-            needs_gpu=stage.needs_gpu,
+            queue_key=queue_key(job.created_at, job.id, position),
+            resource=resource_of(stage.needs_gpu),
             max_attempts=max_attempts,
             lease_token=0,
             attempt=0,
-            crashes=0,
             progress=0.0,
             message="",
         )
@@ -94,11 +101,12 @@ def create_job(
         options=options,
         labels=labels or {},
         seed=seed,
+        generation=1,
         created_at=when,
     )
     session.add(job)
     session.flush()
-    rows = _stage_rows(job.id, stages, max_attempts)
+    rows = _stage_rows(job, stages, max_attempts)
     session.add_all(rows)
     record_event(session, job.id, "job.queued", when)
     session.flush()
@@ -120,7 +128,7 @@ def request_cancel(session: Session, job_id: str, when: datetime | None = None) 
     job, stages = lock_job(session, job_id)
     when = when or now(session)
     if job.state in ("queued", "running"):
-        drop_waiting(session, stages, when)
+        drop_waiting(session, stages, when, "job_cancelled")
         running = any(row.state == "running" for row in stages)
         state = "cancelling" if running else "cancelled"
         set_job(session, job, state, when, cancel_requested_at=when)
@@ -135,7 +143,7 @@ def delete_job(session: Session, job_id: str, when: datetime | None = None) -> N
     job, stages = lock_job(session, job_id)
     if job.state in ("running", "cancelling") or any(row.state == "running" for row in stages):
         raise ConflictError(f"Job {job_id} is {job.state}; cancel it first.")
-    for record in (Event, LogLine, StageRow):
+    for record in (Event, LogLine, StageRun, StageRow):
         session.execute(delete(record).where(record.job_id == job_id))
     session.add(PendingDeletion(prefix=job_prefix(job_id), created_at=when or now(session)))
     session.execute(delete(Job).where(Job.id == job_id))

@@ -1,12 +1,14 @@
-"""A stage's life from claim to end: every change that a worker makes, as a named operation.
+"""A claimed stage's life to its end: every change that a worker makes, as a named operation.
 
-A claim is the right to run one attempt. Its token rises with every claim and goes with every write:
-a write under another token raises LostLeaseError, and the caller throws its work away. Callers
-commit, and ring the bell for the stage ids that an operation returns after the commit. `when` is
-for tests; it defaults to the database's clock.
+A write under a token that is no longer the stage's raises LostLeaseError, and the caller throws its
+work away. An operation that ends a claim may be repeated after a COMMIT whose answer was lost: the
+second call finds the end recorded (`storage.runs`), changes nothing and says what the first did.
+Callers commit, and ring the bell for the stage ids that an operation returns after the commit.
+`when` is for tests; it defaults to the database's clock.
 
-Two counts end a stage that keeps failing: errors (`fail_stage`, up to the row's max_attempts) and
-crashes, where the process or its worker died (`crash_stage`, `reap_expired`, `release_worker`).
+A stage that keeps ending badly fails for good by the cap of the cause: an error that trying again
+may help (`fail_stage`, up to the row's max_attempts), or one of `CAPS`. A run that saved a
+checkpoint got on, and the counts start anew.
 """
 
 from __future__ import annotations
@@ -15,35 +17,35 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, cast
 
-from sqlalchemy import CursorResult, select, update
+from sqlalchemy import ColumnElement, CursorResult, select, update
 from sqlalchemy.orm import Session
 
-from storage.db import now
+from storage.claims import Claim
+from storage.db import name_actor, now
 from storage.errors import LostLeaseError, NotFoundError
-from storage.models import Job, StageRow
-from storage.transitions import fail_for_good, lock_job, set_job, set_stage, settle
+from storage.models import Job, StageRow, StageRun
+from storage.runs import RunEnd, count_checkpoint, count_ends, run_of
+from storage.transitions import fail_for_good, lock_job, set_stage, settle
 
-MAX_CRASHES = 3
+CAPS = {
+    "killed": 3,
+    "out_of_memory": 2,
+    "crashed": 2,
+    "stalled": 2,
+    "time_limit": 1,
+    "lost": 5,
+}
+"""How often in a row a stage may end so, without getting on between."""
+
+BOOT_MARK = "#"
 BACKOFF_FIRST_S = 5.0
 BACKOFF_FACTOR = 4.0
 BACKOFF_MOST_S = 300.0
 WORKER_LOST = {
     "code": "worker_lost",
     "message": "The worker that ran this stage stopped without a word, several times.",
-    "hint": "Look at the worker's log and the machine's memory; then submit the job again.",
+    "hint": "Look at the worker's log and the machine's memory; then retry the job.",
 }
-
-
-@dataclass(frozen=True)
-class Claim:
-    """The right to run one attempt of a stage. `token` goes with every write."""
-
-    stage_id: str
-    job_id: str
-    name: str
-    owner: str
-    token: int
-    attempt: int
 
 
 @dataclass(frozen=True)
@@ -71,43 +73,6 @@ def backoff_s(failures: int) -> float:
     return min(BACKOFF_FIRST_S * BACKOFF_FACTOR ** max(failures - 1, 0), BACKOFF_MOST_S)
 
 
-def claim_stage(
-    session: Session, stage: str, owner: str, lease_s: float, when: datetime | None = None
-) -> Claim | None:
-    """Take a stage that is `ready` and due. None where another was first, or it is not time."""
-    job_id = session.scalar(select(StageRow.job_id).where(StageRow.id == stage))
-    if job_id is None:
-        return None
-    job, stages = lock_job(session, job_id)
-    when = when or now(session)
-    row = next(row for row in stages if row.id == stage)
-    due = row.not_before is None or row.not_before <= when
-    if row.state != "ready" or not due or job.state not in ("queued", "running"):
-        return None
-    token, attempt = row.lease_token + 1, row.attempt + 1
-    set_stage(
-        session,
-        row,
-        "running",
-        when,
-        lease_token=token,
-        lease_owner=owner,
-        lease_until=when + timedelta(seconds=lease_s),
-        heartbeat_at=when,
-        attempt=attempt,
-        not_before=None,
-        progress=0.0,
-        message="",
-        eta_s=None,
-        started_at=when,
-        finished_at=None,
-        error=None,
-    )
-    if job.state == "queued":
-        set_job(session, job, "running", when, started_at=when)
-    return Claim(row.id, job_id, row.name, owner, token, attempt)
-
-
 def heartbeat(
     session: Session,
     claim: Claim,
@@ -126,6 +91,7 @@ def heartbeat(
     }
     if progress is not None:
         values |= {"progress": progress, "message": message or "", "eta_s": eta_s}
+        values["progress_at"] = when
     statement = (
         update(StageRow)
         .where(
@@ -144,6 +110,7 @@ def heartbeat(
 
 def _locked(session: Session, claim: Claim) -> tuple[Job, list[StageRow], StageRow]:
     """The job, locked, and the stage. Raises LostLeaseError where the job was deleted."""
+    name_actor(session, f"worker:{claim.owner}")
     try:
         job, stages = lock_job(session, claim.job_id)
     except NotFoundError as error:
@@ -151,12 +118,22 @@ def _locked(session: Session, claim: Claim) -> tuple[Job, list[StageRow], StageR
     return job, stages, next(row for row in stages if row.id == claim.stage_id)
 
 
-def _held(session: Session, claim: Claim) -> tuple[Job, list[StageRow], StageRow]:
-    """The same, where the claim still holds; raises LostLeaseError where it is void."""
+def _held(
+    session: Session, claim: Claim, outcome: str = ""
+) -> tuple[Job, list[StageRow], StageRow, StageRun | None]:
+    """The same, where the claim still holds; raises LostLeaseError where it is void.
+
+    The last value is the claim's run where it has ended with this outcome before: an earlier call
+    was recorded, and there is nothing left to do.
+    """
     job, stages, row = _locked(session, claim)
-    if row.state != "running" or row.lease_token != claim.token:
-        raise LostLeaseError(f"stage {claim.stage_id} is {row.state} under token {row.lease_token}")
-    return job, stages, row
+    if row.state == "running" and row.lease_token == claim.token:
+        return job, stages, row, None
+    if outcome:
+        run = run_of(session, claim.job_id, claim.name, claim.token)
+        if run is not None and run.outcome == outcome:
+            return job, stages, row, run
+    raise LostLeaseError(f"stage {claim.stage_id} is {row.state} under token {row.lease_token}")
 
 
 def succeed_stage(
@@ -165,36 +142,38 @@ def succeed_stage(
     *,
     manifest: dict[str, Any],
     output_prefix: str,
+    peak_bytes: int | None = None,
     when: datetime | None = None,
 ) -> list[str]:
-    """Publish: the stage succeeded, those behind it may start. Ids newly ready.
-
-    Safe to repeat after a commit whose outcome is unknown: the second call changes nothing.
-    """
-    _, stages, row = _locked(session, claim)
-    if row.state == "succeeded" and row.lease_token == claim.token:
+    """Publish: the stage succeeded, those behind it may start. Ids newly ready."""
+    job, stages, row, earlier = _held(session, claim, "succeeded")
+    if earlier is not None:
         return [other.id for other in stages if other.state == "ready"]
-    job, stages, row = _held(session, claim)
     when = when or now(session)
     set_stage(
         session,
         row,
         "succeeded",
         when,
+        run=RunEnd("succeeded", peak_bytes=peak_bytes),
         manifest=manifest,
         summary=manifest.get("summary"),
         output_prefix=output_prefix,
         checkpoint_prefix=None,
         progress=1.0,
+        progress_at=when,
     )
     return settle(session, job, stages, when)
 
 
 def save_checkpoint(session: Session, claim: Claim, prefix: str) -> str | None:
     """Make an uploaded checkpoint the stage's latest. Returns the one it replaces, to delete."""
-    _, _, row = _held(session, claim)
+    _, _, row, _ = _held(session, claim)
     old = row.checkpoint_prefix
+    if old == prefix:
+        return None
     row.checkpoint_prefix = prefix
+    count_checkpoint(session, row)
     return old
 
 
@@ -205,6 +184,7 @@ def fail_stage(
     *,
     retryable: bool,
     report: FailureReport | None = None,
+    peak_bytes: int | None = None,
     when: datetime | None = None,
 ) -> str:
     """An attempt ended with an error: try again later if that can help, else fail the job.
@@ -212,14 +192,18 @@ def fail_stage(
     error: `{code, message, hint, ...}`. report: kept where the job fails. Returns the stage's new
     state.
     """
-    job, stages, row = _held(session, claim)
+    job, stages, row, earlier = _held(session, claim, "error")
+    if earlier is not None:
+        return str(earlier.led_to)
     when = when or now(session)
-    failures = row.attempt - row.crashes
+    run = RunEnd("error", error, peak_bytes=peak_bytes)
+    failures = count_ends(session, row, "error")
     if retryable and failures < row.max_attempts and job.state == "running":
         later = when + timedelta(seconds=backoff_s(failures))
-        set_stage(session, row, "ready", when, not_before=later, error=error)
+        set_stage(session, row, "ready", when, run=run, not_before=later, error=error)
         return "ready"
-    fail_for_good(session, job, stages, row, error, when, **(report.values() if report else {}))
+    values = report.values() if report else {}
+    fail_for_good(session, job, stages, row, error, when, run=run, **values)
     return "failed"
 
 
@@ -228,86 +212,106 @@ def _lose(
     job: Job,
     stages: list[StageRow],
     row: StageRow,
-    error: dict[str, Any],
-    max_crashes: int,
+    run: RunEnd,
     when: datetime,
     report: FailureReport | None = None,
+    reason: str = "",
 ) -> str:
-    crashes = row.crashes + 1
+    error = run.error or {}
+    count = count_ends(session, row, run.outcome)
     if job.state != "running":
-        set_stage(session, row, "cancelled", when, crashes=crashes)
+        reason = reason or f"job_{job.state}"
+        set_stage(session, row, "cancelled", when, run=run, reason=reason)
         settle(session, job, stages, when)
         return "cancelled"
-    if crashes >= max_crashes:
+    if count >= CAPS[run.outcome]:
         values = report.values() if report else {}
-        fail_for_good(session, job, stages, row, error, when, crashes=crashes, **values)
+        fail_for_good(session, job, stages, row, error, when, run=run, **values)
         return "failed"
-    later = when + timedelta(seconds=backoff_s(crashes - 1)) if crashes > 1 else None
-    set_stage(session, row, "ready", when, crashes=crashes, not_before=later, error=error)
+    later = when + timedelta(seconds=backoff_s(count - 1)) if count > 1 else None
+    set_stage(session, row, "ready", when, run=run, reason=reason, not_before=later, error=error)
     return "ready"
 
 
 def crash_stage(
     session: Session,
     claim: Claim,
-    error: dict[str, Any],
+    run: RunEnd,
     *,
-    max_crashes: int = MAX_CRASHES,
     report: FailureReport | None = None,
     when: datetime | None = None,
 ) -> str:
-    """The stage's process died under the claim. The first retry is at once. The new state.
+    """The stage's process died, or was ended, under the claim. The new state.
 
-    report: kept where the job fails.
+    run: how, with its error; the outcome is one of `CAPS`. The first retry is at once. report: kept
+    where the job fails.
     """
-    job, stages, row = _held(session, claim)
-    return _lose(session, job, stages, row, error, max_crashes, when or now(session), report)
+    job, stages, row, earlier = _held(session, claim, run.outcome)
+    if earlier is not None:
+        return str(earlier.led_to)
+    return _lose(session, job, stages, row, run, when or now(session), report)
 
 
 def release_stage(session: Session, claim: Claim, when: datetime | None = None) -> str:
     """Give a stage back unharmed (the worker shuts down): the attempt does not count."""
-    job, stages, row = _held(session, claim)
-    when = when or now(session)
+    job, stages, row, earlier = _held(session, claim, "released")
+    if earlier is not None:
+        return str(earlier.led_to)
+    when, run = when or now(session), RunEnd("released")
     if job.state != "running":
-        set_stage(session, row, "cancelled", when)
+        set_stage(session, row, "cancelled", when, run=run, reason=f"job_{job.state}")
         settle(session, job, stages, when)
         return "cancelled"
-    set_stage(session, row, "ready", when, attempt=row.attempt - 1)
+    attempt = row.attempt - 1
+    set_stage(session, row, "ready", when, run=run, reason="shutdown", attempt=attempt)
     return "ready"
 
 
-def cancel_stage(session: Session, claim: Claim, when: datetime | None = None) -> None:
+def cancel_stage(session: Session, claim: Claim, when: datetime | None = None) -> str:
     """The claimed stage was stopped because its job was cancelled, or failed elsewhere."""
-    job, stages, row = _held(session, claim)
-    when = when or now(session)
-    set_stage(session, row, "cancelled", when)
-    settle(session, job, stages, when)
+    job, stages, row, earlier = _held(session, claim, "cancelled")
+    if earlier is None:
+        when = when or now(session)
+        reason = f"job_{job.state}"
+        set_stage(session, row, "cancelled", when, run=RunEnd("cancelled"), reason=reason)
+        settle(session, job, stages, when)
+    return "cancelled"
 
 
-def _lose_all(session: Session, owner: str | None, when: datetime) -> list[str]:
-    """Lose the leases that ran out, or all of one owner, job by job in one order. Ids now ready."""
-    lost = StageRow.lease_until < when if owner is None else StageRow.lease_owner == owner
-    job_ids = session.scalars(
-        select(StageRow.job_id).where(StageRow.state == "running", lost).distinct()
-    )
+def _lose_all(
+    session: Session, lost: ColumnElement[bool], when: datetime, reason: str
+) -> list[str]:
+    """Lose the leases that a condition finds, job by job in one order. Ids that are ready again.
+
+    What was found is looked at again under the job's lock: a heartbeat may have come between.
+    """
+    running = (StageRow.state == "running") & lost
+    job_ids = session.scalars(select(StageRow.job_id).where(running).distinct())
     ready = []
     for job_id in sorted(job_ids):
         job, stages = lock_job(session, job_id)
+        still = set(session.scalars(select(StageRow.id).where(running, StageRow.job_id == job_id)))
         for row in stages:
-            if row.state != "running" or row.lease_until is None:
-                continue
-            if row.lease_until >= when if owner is None else row.lease_owner != owner:
-                continue
-            if _lose(session, job, stages, row, WORKER_LOST, MAX_CRASHES, when) == "ready":
-                ready.append(row.id)
+            if row.id in still:
+                run = RunEnd("lost", WORKER_LOST)
+                state = _lose(session, job, stages, row, run, when, reason=reason)
+                ready += [row.id] if state == "ready" else []
     return ready
 
 
 def reap_expired(session: Session, when: datetime | None = None) -> list[str]:
     """Take back the stages whose leases ran out. Ids that are ready again."""
-    return _lose_all(session, None, when or now(session))
+    when = when or now(session)
+    return _lose_all(session, StageRow.lease_until < when, when, reason="lease_expired")
 
 
-def release_worker(session: Session, owner: str, when: datetime | None = None) -> list[str]:
-    """Free what a worker's former self held: for a worker that starts again under its old id."""
-    return _lose_all(session, owner, when or now(session))
+def owner_name(worker_id: str, boot: str) -> str:
+    """Who holds a lease: a worker's id, and which of the processes that ever bore it."""
+    return f"{worker_id}{BOOT_MARK}{boot}"
+
+
+def release_worker(session: Session, worker_id: str, when: datetime | None = None) -> list[str]:
+    """Free what a worker's former selves held: for one that starts again under its old id."""
+    owner = StageRow.lease_owner
+    mine = (owner == worker_id) | owner.startswith(worker_id + BOOT_MARK, autoescape=True)
+    return _lose_all(session, mine, when or now(session), reason="worker_restarted")

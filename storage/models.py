@@ -73,7 +73,7 @@ class Capture(Base):
 
 
 class Job(Base):
-    """One run of the stages on one capture."""
+    """The stages on one capture. generation: 1, and one more with every retry."""
 
     __tablename__ = "jobs"
 
@@ -85,6 +85,7 @@ class Job(Base):
     options: Mapped[dict[str, Any]] = mapped_column(CleanJson)
     labels: Mapped[dict[str, str]] = mapped_column(CleanJson, default=dict)
     seed: Mapped[int] = mapped_column(BigInteger, default=0)
+    generation: Mapped[int] = mapped_column(Integer, default=1)
     error: Mapped[dict[str, Any] | None] = mapped_column(CleanJson(none_as_null=True))
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
     started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
@@ -94,15 +95,16 @@ class Job(Base):
     capture: Mapped[Capture] = relationship(lazy="raise")
     stages: Mapped[list[StageRow]] = relationship(order_by="StageRow.seq", lazy="select")
 
-    __table_args__ = (Index(None, "created_at", "id"), Index(None, "state", "created_at"))
+    __table_args__ = (Index(None, "created_at", "id"), Index(None, "state", "created_at", "id"))
 
 
 class StageRow(Base):
     """One stage of one job, and its lease.
 
-    attempt: claims so far, without those that were released. crashes: how many of them ended with
-    the process instead of an error. not_before: when a retry may start. ready_at: since when it
-    could run. rung_at: when the bell last rang for it. manifest: what `manifest.json` holds.
+    queue_key: sorts the stages that wait in the order of service. resource: what it runs on, "cpu"
+    or "gpu". attempt: claims in this generation of the job, without those that were released.
+    not_before: when a retry may start. ready_at: since when it could run. rung_at: when the bell
+    last rang for it. progress_at: when it last got on. manifest: what `manifest.json` holds.
     """
 
     __tablename__ = "stages"
@@ -113,10 +115,10 @@ class StageRow(Base):
     seq: Mapped[int] = mapped_column(Integer)
     after: Mapped[list[str]] = mapped_column(CleanJson)
     state: Mapped[str] = mapped_column(String(16))
-    needs_gpu: Mapped[bool] = mapped_column(Boolean, default=False)
+    queue_key: Mapped[str] = mapped_column(String(48))
+    resource: Mapped[str] = mapped_column(String(8))
     attempt: Mapped[int] = mapped_column(Integer, default=0)
     max_attempts: Mapped[int] = mapped_column(Integer, default=3)
-    crashes: Mapped[int] = mapped_column(Integer, default=0)
     not_before: Mapped[datetime | None] = mapped_column(UtcDateTime)
     ready_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     rung_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
@@ -124,6 +126,7 @@ class StageRow(Base):
     lease_token: Mapped[int] = mapped_column(Integer, default=0)
     lease_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
     heartbeat_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    progress_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     progress: Mapped[float] = mapped_column(default=0.0)
     message: Mapped[str] = mapped_column(CleanText(300), default="")
     eta_s: Mapped[float | None] = mapped_column()
@@ -139,12 +142,47 @@ class StageRow(Base):
 
     __table_args__ = (
         Index(None, "state", "lease_until"),
+        Index(None, "state", "resource", "queue_key"),
         Index(None, "job_id", "name", unique=True),
     )
 
 
+class StageRun(Base):
+    """One claim of a stage, from its start to its end: what a later claim does not overwrite.
+
+    owner: the worker's id and its boot nonce. outcome: how it ended (`storage.runs.OUTCOMES`), None
+    while it runs. led_to: the state that its end put the stage into. checkpoints: how many it
+    saved. exit_code: of the stage's process, negative for a signal. peak_bytes: the most memory
+    that process held.
+    """
+
+    __tablename__ = "stage_runs"
+
+    id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    stage: Mapped[str] = mapped_column(String(32))
+    token: Mapped[int] = mapped_column(Integer)
+    generation: Mapped[int] = mapped_column(Integer)
+    attempt: Mapped[int] = mapped_column(Integer)
+    owner: Mapped[str] = mapped_column(String(128))
+    started_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    outcome: Mapped[str | None] = mapped_column(String(16))
+    led_to: Mapped[str | None] = mapped_column(String(16))
+    checkpoints: Mapped[int] = mapped_column(Integer, default=0)
+    error: Mapped[dict[str, Any] | None] = mapped_column(CleanJson(none_as_null=True))
+    exit_code: Mapped[int | None] = mapped_column(Integer)
+    peak_bytes: Mapped[int | None] = mapped_column(BigInteger)
+
+    __table_args__ = (Index(None, "job_id", "stage", "token", unique=True),)
+
+
 class Event(Base):
-    """What happened, in order: the feed of state changes, written in their transactions."""
+    """What happened, in order: the feed of state changes, written in their transactions.
+
+    actor: who changed it ("worker:ID", "api-key:ID", "service"). reason: why, in a word or an
+    error's code; empty where the kind says it all.
+    """
 
     __tablename__ = "events"
 
@@ -152,6 +190,8 @@ class Event(Base):
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     stage: Mapped[str | None] = mapped_column(String(32))
     kind: Mapped[str] = mapped_column(String(48))
+    actor: Mapped[str] = mapped_column(CleanText(160))
+    reason: Mapped[str] = mapped_column(CleanText(100), default="")
     data: Mapped[dict[str, Any]] = mapped_column(CleanJson, default=dict)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
@@ -174,13 +214,17 @@ class LogLine(Base):
 
 
 class Worker(Base):
-    """A worker process and what it has. It is live while `seen_at` is fresh."""
+    """A worker process and what it has. It is live while `seen_at` is fresh.
+
+    boot: chance, made when the process starts; tells two that were given one id apart.
+    """
 
     __tablename__ = "workers"
 
     id: Mapped[str] = mapped_column(String(128), primary_key=True)
     hostname: Mapped[str] = mapped_column(CleanText(255))
     pid: Mapped[int] = mapped_column(Integer)
+    boot: Mapped[str] = mapped_column(String(16))
     queues: Mapped[list[str]] = mapped_column(CleanJson)
     slots: Mapped[int] = mapped_column(Integer, default=1)
     has_gpu: Mapped[bool] = mapped_column(Boolean, default=False)

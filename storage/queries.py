@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
@@ -12,13 +13,15 @@ from typing import Any, TypeVar
 from sqlalchemy import Select, and_, func, or_, select, tuple_
 from sqlalchemy.orm import Session, joinedload, selectinload, undefer
 
+from storage.claims import Claim, is_due
 from storage.db import now
 from storage.errors import InvalidCursorError, NotFoundError
-from storage.leases import Claim
 from storage.models import Capture, Event, Job, StageRow, is_id
+from storage.queue import RESOURCES
 from storage.states import JOB_STATES
 
 MAX_PAGE = 200
+QUEUE_COUNTED = 1000
 Record = TypeVar("Record", Job, Capture)
 
 
@@ -50,7 +53,7 @@ class WaitingStage:
     """A stage that could run now. since: from when on."""
 
     id: str
-    needs_gpu: bool
+    resource: str
     since: datetime
     rung_at: datetime | None
 
@@ -136,12 +139,15 @@ def get_job(session: Session, job_id: str, *, manifests: bool = False) -> Job:
 
 
 def queue_position(session: Session, job: Job) -> int | None:
-    """1 for the job that is served next, and so on; None for a job that is not queued."""
+    """1 for the job that is served next, and so on; None for a job that is not queued.
+
+    Counted up to QUEUE_COUNTED, which means so many or more: an answer costs the same in any queue.
+    """
     if job.state != "queued":
         return None
     before = tuple_(Job.created_at, Job.id) < tuple_(job.created_at, job.id)
-    count = select(func.count()).select_from(Job).where(Job.state == "queued", before)
-    return session.scalars(count).one() + 1
+    earlier = select(Job.id).where(Job.state == "queued", before).limit(QUEUE_COUNTED - 1)
+    return session.scalars(select(func.count()).select_from(earlier.subquery())).one() + 1
 
 
 def list_events(session: Session, job_id: str, after_seq: int = 0, limit: int = 500) -> list[Event]:
@@ -185,31 +191,40 @@ def is_cancel_requested(session: Session, claim: Claim) -> bool:
 
 
 def ready_unclaimed(
-    session: Session, older_than_s: float = 0.0, when: datetime | None = None, limit: int = 100
+    session: Session,
+    older_than_s: float = 0.0,
+    when: datetime | None = None,
+    limit: int = 100,
+    resources: Sequence[str] = RESOURCES,
 ) -> list[WaitingStage]:
-    """Stages that could run since at least so many seconds, first come first served."""
+    """Stages that could run since at least so many seconds, in the order of service.
+
+    limit: of each resource, so that a queue for one hides none for the other.
+    """
     when = when or now(session)
     edge = when - timedelta(seconds=older_than_s)
-    query = (
-        select(StageRow, Job.created_at)
-        .join(Job, Job.id == StageRow.job_id)
-        .where(
-            StageRow.state == "ready",
-            Job.state.in_(("queued", "running")),
-            StageRow.ready_at <= edge,
-            or_(StageRow.not_before.is_(None), StageRow.not_before <= edge),
+    found: list[StageRow] = []
+    for resource in resources:
+        query = (
+            select(StageRow)
+            .where(
+                StageRow.state == "ready",
+                StageRow.resource == resource,
+                StageRow.ready_at <= edge,
+                is_due(edge),
+            )
+            .order_by(StageRow.queue_key)
+            .limit(limit)
         )
-        .order_by(Job.created_at, Job.id, StageRow.seq)
-        .limit(limit)
-    )
+        found += session.scalars(query)
     return [
         WaitingStage(
             row.id,
-            row.needs_gpu,
+            row.resource,
             max(moment for moment in (row.ready_at, row.not_before) if moment is not None),
             row.rung_at,
         )
-        for row, _ in session.execute(query)
+        for row in sorted(found, key=lambda row: row.queue_key)
     ]
 
 

@@ -10,10 +10,10 @@ from typing import Any
 from sqlalchemy import delete, func, insert, select
 from sqlalchemy.orm import Session
 
+from storage.claims import Claim
 from storage.db import clean_text, now
 from storage.errors import ConflictError, NotFoundError
 from storage.keys import capture_prefix
-from storage.leases import Claim
 from storage.models import Capture, Job, LogLine, PendingDeletion, Worker
 from storage.states import JOB_LIVE
 
@@ -90,27 +90,46 @@ def register_worker(
     *,
     hostname: str,
     pid: int,
+    boot: str,
     queues: Sequence[str],
     slots: int,
     has_gpu: bool,
+    take_over: bool = False,
     when: datetime | None = None,
-) -> None:
-    """Record, or refresh, what a worker has."""
+) -> bool:
+    """Record, or refresh, what a worker has.
+
+    False where another process goes by this id (another boot), which changes nothing; take_over
+    puts this one in its place.
+    """
     when = when or now(session)
-    row = session.get(Worker, worker_id)
-    if row is None or row.pid != pid or row.hostname != hostname:
-        if row is not None:
-            session.delete(row)
-            session.flush()
-        row = Worker(id=worker_id, started_at=when)
+    row = session.get(Worker, worker_id, with_for_update=True, populate_existing=True)
+    if row is not None and row.boot != boot:
+        if not take_over:
+            return False
+        session.delete(row)
+        session.flush()
+        row = None
+    if row is None:
+        row = Worker(id=worker_id, started_at=when, boot=boot)
         session.add(row)
     row.hostname, row.pid, row.queues = hostname, pid, list(queues)
     row.slots, row.has_gpu, row.seen_at = slots, has_gpu, when
+    return True
 
 
-def forget_worker(session: Session, worker_id: str) -> None:
+def worker_seen_lately(
+    session: Session, worker_id: str, when: datetime | None = None
+) -> Worker | None:
+    """The worker that goes by this id and was seen within the last minute, its row locked."""
+    row = session.get(Worker, worker_id, with_for_update=True, populate_existing=True)
+    edge = (when or now(session)) - timedelta(seconds=WORKER_LIVE_S)
+    return row if row is not None and row.seen_at >= edge else None
+
+
+def forget_worker(session: Session, worker_id: str, boot: str) -> None:
     """A worker ends in order."""
-    session.execute(delete(Worker).where(Worker.id == worker_id))
+    session.execute(delete(Worker).where(Worker.id == worker_id, Worker.boot == boot))
 
 
 def live_workers(session: Session, when: datetime | None = None) -> list[Worker]:

@@ -18,8 +18,8 @@ UPGRADE_S = 900.0  # a migration may rewrite a large table
 _MIGRATIONS = Path(__file__).parent / "migrations"
 
 
-def upgrade(database_url: str) -> None:
-    """Bring the schema to the newest revision. Safe to call from several processes at once."""
+def upgrade(database_url: str, revision: str = "head") -> None:
+    """Bring the schema to a revision, the newest. Safe to call from several processes at once."""
     engine = make_engine(database_url, UPGRADE_S)
     try:
         with engine.begin() as connection:  # BEGIN IMMEDIATE on SQLite: others wait
@@ -28,6 +28,6 @@ def upgrade(database_url: str) -> None:
             config = Config()
             config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
             config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+            command.upgrade(config, revision)
     finally:
         engine.dispose()

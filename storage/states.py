@@ -1,7 +1,7 @@
 """The states of jobs and stages, and which may follow which.
 
-`storage.jobs` and `storage.leases` alone change a state, through `storage.transitions`; each change
-names its old state in the UPDATE itself and is checked against these tables.
+`storage.jobs`, `storage.claims` and `storage.leases` alone change a state; each change names its
+old state in the UPDATE itself and is checked against these tables.
 
     stage:  blocked -> ready -> running -> succeeded
                 ^        |         |-> ready        released, retried, or its worker was lost

@@ -1,8 +1,9 @@
-"""How a state changes: the one mechanism under `storage.jobs` and `storage.leases`.
+"""How a state changes: the one mechanism under `storage.jobs`, `storage.claims`, `storage.leases`.
 
-Every change locks the job's row first (on SQLite a writing session holds the whole file), names
-the old state and the fencing token in its UPDATE, is checked against `storage.states`, and records
-an event in the same transaction. Only those two modules use this one.
+Every change locks rows in one order, a job's stages by their places and then the job (on SQLite a
+writing session holds the whole file), names the old state, the fencing token and the lease that was
+read in its UPDATE, is checked against `storage.states`, and records an event in the same
+transaction. Only those three modules use this one.
 """
 
 from __future__ import annotations
@@ -13,38 +14,81 @@ from typing import Any, cast
 from sqlalchemy import CursorResult, select, update
 from sqlalchemy.orm import Session
 
+from storage.db import ACTOR
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
 from storage.models import Event, Job, StageRow
+from storage.runs import RunEnd, end_run
 from storage.states import JOB_TERMINAL, STAGE_DONE, check_transition
 
 
 def record_event(
-    session: Session, job_id: str, kind: str, when: datetime, stage: str | None = None, **data: Any
+    session: Session,
+    job_id: str,
+    kind: str,
+    when: datetime,
+    stage: str | None = None,
+    reason: str = "",
+    **data: Any,
 ) -> None:
-    session.add(Event(job_id=job_id, stage=stage, kind=kind, data=data, created_at=when))
+    """Note what happened, under the session's actor (`Database.session_scope`)."""
+    session.add(
+        Event(
+            job_id=job_id,
+            stage=stage,
+            kind=kind,
+            actor=session.info.get(ACTOR, "service"),
+            reason=reason,
+            data=data,
+            created_at=when,
+        )
+    )
 
 
 def lock_job(session: Session, job_id: str) -> tuple[Job, list[StageRow]]:
-    """The job, locked until the transaction ends, and its stages as they are now."""
+    """The job and its stages as they are now, locked until the transaction ends.
+
+    Stages before the job: so does a claim, which begins with one stage. Others may still add rows
+    that name the job (events, log lines).
+    """
     fresh = {"populate_existing": True}
+    stages = session.scalars(
+        select(StageRow)
+        .where(StageRow.job_id == job_id)
+        .order_by(StageRow.seq)
+        .with_for_update(key_share=True),
+        execution_options=fresh,
+    ).all()
     job = session.scalars(
-        select(Job).where(Job.id == job_id).with_for_update(), execution_options=fresh
+        select(Job).where(Job.id == job_id).with_for_update(key_share=True),
+        execution_options=fresh,
     ).one_or_none()
     if job is None:
         raise NotFoundError("job", job_id)
-    stages = session.scalars(
-        select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.seq),
-        execution_options=fresh,
-    ).all()
     return job, list(stages)
 
 
-def set_stage(session: Session, row: StageRow, state: str, when: datetime, **values: Any) -> None:
-    """Compare-and-set on state and token; drops the lease where the stage leaves `running`."""
+def set_stage(
+    session: Session,
+    row: StageRow,
+    state: str,
+    when: datetime,
+    *,
+    run: RunEnd | None = None,
+    reason: str = "",
+    **values: Any,
+) -> None:
+    """Compare-and-set on state, token and lease; drops the lease where the stage leaves `running`.
+
+    run: how the claim ended, where the stage leaves `running`.
+    """
     check_transition("stage", row.state, state)
     old, data = row.state, {"attempt": values.get("attempt", row.attempt)}
     if old == "running":
+        if run is None:
+            raise ValueError(f"stage {row.id} leaves running, and nobody says how its claim ended")
         values |= {"lease_owner": None, "lease_until": None, "eta_s": None}
+        end_run(session, row, run, state, when)
+        data["outcome"] = run.outcome
     if state == "ready":
         values.setdefault("ready_at", when)
         values.setdefault("rung_at", None)
@@ -56,17 +100,23 @@ def set_stage(session: Session, row: StageRow, state: str, when: datetime, **val
             StageRow.id == row.id,
             StageRow.state == old,
             StageRow.lease_token == row.lease_token,
+            StageRow.lease_until == row.lease_until
+            if row.lease_until is not None
+            else StageRow.lease_until.is_(None),
         )
         .values(state=state, **values)
     )
     if cast("CursorResult[Any]", session.execute(statement)).rowcount != 1:
-        raise LostLeaseError(f"stage {row.id} is no longer {old}")
+        raise LostLeaseError(f"stage {row.id} is no longer {old}, or its lease was extended")
     if values.get("error"):
         data["error"] = values["error"]
-    record_event(session, row.job_id, f"stage.{state}", when, row.name, was=old, **data)
+        reason = reason or str(values["error"].get("code", ""))
+    record_event(session, row.job_id, f"stage.{state}", when, row.name, reason, was=old, **data)
 
 
-def set_job(session: Session, job: Job, state: str, when: datetime, **values: Any) -> None:
+def set_job(
+    session: Session, job: Job, state: str, when: datetime, *, reason: str = "", **values: Any
+) -> None:
     check_transition("job", job.state, state)
     old = job.state
     if state in JOB_TERMINAL:
@@ -75,7 +125,9 @@ def set_job(session: Session, job: Job, state: str, when: datetime, **values: An
     result = session.execute(statement.values(state=state, **values))
     if cast("CursorResult[Any]", result).rowcount != 1:
         raise ConflictError(f"job {job.id} is no longer {old}")
-    record_event(session, job.id, f"job.{state}", when, was=old)
+    if values.get("error"):
+        reason = reason or str(values["error"].get("code", ""))
+    record_event(session, job.id, f"job.{state}", when, reason=reason, was=old)
 
 
 def _is_done(name: str, by_name: dict[str, StageRow]) -> bool:
@@ -107,10 +159,12 @@ def settle(session: Session, job: Job, stages: list[StageRow], when: datetime) -
     return [row.id for row in ready]
 
 
-def drop_waiting(session: Session, stages: list[StageRow], when: datetime) -> None:
+def drop_waiting(
+    session: Session, stages: list[StageRow], when: datetime, reason: str = ""
+) -> None:
     for row in stages:
         if row.state in ("blocked", "ready"):
-            set_stage(session, row, "cancelled", when)
+            set_stage(session, row, "cancelled", when, reason=reason)
 
 
 def fail_for_good(
@@ -120,11 +174,13 @@ def fail_for_good(
     row: StageRow,
     error: dict[str, Any],
     when: datetime,
+    *,
+    run: RunEnd,
     **values: Any,
 ) -> None:
     """The stage and, unless it ends otherwise already, the job fail; what waits is dropped."""
-    set_stage(session, row, "failed", when, error=error, **values)
+    set_stage(session, row, "failed", when, run=run, error=error, **values)
     if job.state == "running":
         set_job(session, job, "failed", when, error={**error, "stage": row.name})
-        drop_waiting(session, stages, when)
+        drop_waiting(session, stages, when, "job_failed")
     settle(session, job, stages, when)

@@ -28,6 +28,7 @@ from worker.settings import WorkerSettings
 
 EXIT_LIMIT_S = 20.0
 MANY_CORES = 8
+MAX_ID_CHARS = 100
 
 
 def _queues(text: str) -> tuple[str, ...]:
@@ -43,6 +44,12 @@ def _slots(text: str) -> int:
     return int(text)
 
 
+def _worker_id(text: str) -> str:
+    if not 1 <= len(text) <= MAX_ID_CHARS or not text.isprintable():
+        raise argparse.ArgumentTypeError(f"an id has 1 to {MAX_ID_CHARS} characters")
+    return text
+
+
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m worker", description="Runs stages of jobs.")
@@ -56,6 +63,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument(
         "--id",
+        type=_worker_id,
         default=f"{socket.gethostname()}-{os.getpid()}",
         help="a name that stays the same when this worker is started again",
     )

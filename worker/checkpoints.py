@@ -16,9 +16,10 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from storage import keys
+from storage.claims import Claim
 from storage.db import Database
 from storage.errors import LostLeaseError, StorageError
-from storage.leases import Claim, save_checkpoint
+from storage.leases import save_checkpoint
 from storage.objects import ObjectStore
 from worker.transfer import upload_folder
 

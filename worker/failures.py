@@ -18,9 +18,10 @@ from pipelines.manifest import list_files
 from pipelines.stage import REPORT
 from pipelines.stages.report import write_failed_report
 from pipelines.workspace import Workspace
+from storage.claims import Claim
 from storage.db import Database
 from storage.errors import StorageError
-from storage.leases import Claim, FailureReport
+from storage.leases import FailureReport
 from storage.objects import ObjectStore
 from storage.queries import stage_work
 from worker.transfer import upload_folder

@@ -8,10 +8,6 @@ from typing import Any
 
 from pipelines.errors import PipelineError, ResourceError
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
-from storage.leases import MAX_CRASHES
-
-MAX_MEMORY_CRASHES = 2
-MAX_FAULT_CRASHES = 2
 
 
 class StopRunError(Exception):
@@ -31,12 +27,14 @@ class StageFailedError(Exception):
 
 
 class StageCrashedError(Exception):
-    """The stage's process died. After `max_crashes` such ends the stage fails with `error`."""
+    """The stage's process died, or was ended. cause: one of `storage.leases.CAPS`, which says how
+    often that may happen. exit_code: of the process, negative for a signal; None while it lives."""
 
-    def __init__(self, error: dict[str, Any], max_crashes: int) -> None:
+    def __init__(self, cause: str, error: dict[str, Any], exit_code: int | None = None) -> None:
         super().__init__(str(error["code"]))
+        self.cause = cause
         self.error = error
-        self.max_crashes = max_crashes
+        self.exit_code = exit_code
 
 
 def crash_of(stage: str, status: int, out_of_memory: bool) -> StageCrashedError:
@@ -50,31 +48,31 @@ def crash_of(stage: str, status: int, out_of_memory: bool) -> StageCrashedError:
             code="out_of_memory",
             hint="Use a smaller preset, or fewer or smaller images, or a larger machine.",
         )
-        return StageCrashedError(error.as_dict(), MAX_MEMORY_CRASHES)
+        return StageCrashedError("out_of_memory", error.as_dict(), status)
     if status in (-signal.SIGKILL, 128 + signal.SIGKILL, -signal.SIGTERM):
         error = ResourceError(
             f"The process that ran {stage} was killed from outside.",
             code="worker_lost",
-            hint="Look at the worker's log and the machine's memory; then submit the job again.",
+            hint="Look at the worker's log and the machine's memory; then retry the job.",
         )
-        return StageCrashedError(error.as_dict(), MAX_CRASHES)
+        return StageCrashedError("killed", error.as_dict(), status)
     how = f"signal {-status}" if status < 0 else f"status {status}"
     fault = PipelineError(
         f"The process that ran {stage} broke down ({how}).",
         code="stage_crashed",
         hint="This is a fault of the service: see the job's logs for the last lines before it.",
     )
-    return StageCrashedError(fault.as_dict(), MAX_FAULT_CRASHES)
+    return StageCrashedError("crashed", fault.as_dict(), status)
 
 
-def time_limit_of(stage: str, limit_s: float) -> StageFailedError:
+def time_limit_of(stage: str, limit_s: float) -> StageCrashedError:
     """The stage ran for too long."""
     error = PipelineError(
         f"The stage {stage} did not end within {limit_s:.0f} seconds.",
         code="time_limit",
         hint="Use a smaller preset, or a faster machine.",
     )
-    return StageFailedError(error.as_dict())
+    return StageCrashedError("time_limit", error.as_dict())
 
 
 def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
@@ -84,7 +82,7 @@ def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
         return ResourceError(
             f"The disk is full: the files of {stage} could not be stored.",
             code="disk_full",
-            hint="Free some space on the worker's disk or the object store; then submit again.",
+            hint="Free some space on the worker's disk or the object store; then retry the job.",
         ).as_dict()
     if isinstance(error, ObjectMissingError):
         return PipelineError(
@@ -96,7 +94,7 @@ def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
         return ResourceError(
             f"The object store did not answer while {stage} moved its files.",
             code="object_store_unavailable",
-            hint="Check the object store; then submit the job again.",
+            hint="Check the object store; then retry the job.",
         ).as_dict()
     return PipelineError(
         f"The worker failed around {stage} with {type(error).__name__}.",

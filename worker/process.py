@@ -101,6 +101,15 @@ class StageProcess:
         """Whether the child still runs."""
         return self._process.poll() is None
 
+    def peak_bytes(self) -> int | None:
+        """The most memory the child held since its run began; None where the system does not say,
+        or the child is gone."""
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
+                if line.startswith("VmHWM:"):
+                    return int(line.split()[1]) * 1024
+        return None
+
     def exit_reason(self) -> tuple[int, bool]:
         """(exit status, negative for a signal; whether memory ran out). Only after the exit."""
         status = self._process.wait(_EXIT_WAIT_S)

@@ -14,8 +14,9 @@ from types import TracebackType
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from storage.claims import Claim
 from storage.db import Database
-from storage.leases import Claim, heartbeat
+from storage.leases import heartbeat
 from storage.queries import is_cancel_requested
 from storage.records import append_logs
 from worker.settings import WorkerSettings

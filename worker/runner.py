@@ -22,10 +22,10 @@ from sqlalchemy.orm import Session
 from pipelines.stage import Stage
 from pipelines.workspace import Workspace
 from storage import keys
+from storage.claims import Claim
 from storage.db import Database
 from storage.errors import LostLeaseError, NotFoundError, StorageError
 from storage.leases import (
-    Claim,
     FailureReport,
     cancel_stage,
     crash_stage,
@@ -35,10 +35,10 @@ from storage.leases import (
 )
 from storage.objects import ObjectStore
 from storage.queries import StageWork, stage_work
+from storage.runs import RunEnd
 from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.failures import publish_failure
 from worker.outcomes import (
-    MAX_MEMORY_CRASHES,
     StageCrashedError,
     StageFailedError,
     StopRunError,
@@ -126,6 +126,7 @@ class Runner:
         self._shutdown = shutdown
         self._preload: Sequence[str] = ()
         self._process: StageProcess | None = None
+        self._peak_bytes: int | None = None  # of the run at hand
 
     def prepare(self, preload: Sequence[str]) -> None:
         """Start the process before there is anything to run.
@@ -149,7 +150,11 @@ class Runner:
             try:
                 manifest = self._attempt(claim, keeper, prefix)
                 record: Callable[[Session], Any] = lambda session: succeed_stage(  # noqa: E731
-                    session, claim, manifest=manifest, output_prefix=prefix
+                    session,
+                    claim,
+                    manifest=manifest,
+                    output_prefix=prefix,
+                    peak_bytes=self._peak_bytes,
                 )
             except Exception as error:  # noqa: BLE001 every end of an attempt is recorded
                 self._discard(prefix)
@@ -183,7 +188,7 @@ class Runner:
 
     def _attempt(self, claim: Claim, keeper: LeaseKeeper, prefix: str) -> dict[str, Any]:
         guard, workers = self._guard_of(keeper), self._settings.transfers
-        laps = Laps()
+        laps, self._peak_bytes = Laps(), None
         stage = self._registry.get_stage(claim.name)
         with self._database.read_scope() as session:
             work = stage_work(session, claim)
@@ -288,6 +293,7 @@ class Runner:
             if time.monotonic() > deadline:
                 process.kill()
                 raise time_limit_of(stage.name, stage.time_limit_s)
+            self._peak_bytes = process.peak_bytes() or self._peak_bytes
             try:
                 message = process.messages.get(timeout=MESSAGE_STEP_S)
             except queue.Empty:
@@ -305,7 +311,7 @@ class Runner:
                 return manifest
             elif kind == "failed":
                 if message["error"]["code"] == "out_of_memory":
-                    raise StageCrashedError(message["error"], MAX_MEMORY_CRASHES)
+                    raise StageCrashedError("out_of_memory", message["error"])
                 raise StageFailedError(message["error"])
             elif kind == "cancelled":
                 raise StopRunError("cancel")
@@ -337,9 +343,8 @@ class Runner:
             crash = error
             _log.warning("%s: %s", claim.stage_id, crash.error["message"])
             said = self._publish_failure(claim, crash.error, prefix)
-            return lambda session: crash_stage(
-                session, claim, crash.error, max_crashes=crash.max_crashes, report=said
-            )
+            end = RunEnd(crash.cause, crash.error, crash.exit_code, self._peak_bytes)
+            return lambda session: crash_stage(session, claim, end, report=said)
         if isinstance(error, StageFailedError):
             failure = error.error
         else:
@@ -348,7 +353,12 @@ class Runner:
         retryable = bool(failure.pop("retryable", False))
         report = self._publish_failure(claim, failure, prefix)
         return lambda session: fail_stage(
-            session, claim, failure, retryable=retryable, report=report
+            session,
+            claim,
+            failure,
+            retryable=retryable,
+            report=report,
+            peak_bytes=self._peak_bytes,
         )
 
     def _publish_failure(

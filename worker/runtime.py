@@ -12,22 +12,34 @@ from __future__ import annotations
 import logging
 import os
 import queue
+import secrets
 import socket
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
 
 from storage.bell import Bell
+from storage.claims import Claim, claim_next, claim_stage
 from storage.db import Database
-from storage.leases import Claim, claim_stage, release_worker
+from storage.leases import owner_name, release_worker
+from storage.models import Worker
 from storage.open_objects import open_object_store
-from storage.queries import WaitingStage, ready_unclaimed
-from storage.queue import QUEUE_GPU, queue_for
-from storage.records import forget_worker, has_live_gpu, register_worker
+from storage.queries import ready_unclaimed
+from storage.queue import QUEUE_GPU, RESOURCE_GPU, RESOURCES, queue_for, resource_of
+from storage.records import (
+    forget_worker,
+    has_live_gpu,
+    register_worker,
+    worker_seen_lately,
+)
 from storage.settings import StorageSettings
 from worker.compiling import KernelCompiler
 from worker.housekeeping import Housekeeping
+from worker.locks import is_process
 from worker.runner import Runner, load_registry
 from worker.settings import WorkerSettings
 
@@ -36,12 +48,19 @@ _log = logging.getLogger("nerfworks.worker")
 
 @dataclass(frozen=True)
 class WorkerIdentity:
-    """Who a worker is and what it offers. queues: those it really serves."""
+    """Who a worker is and what it offers. queues: those it really serves. boot: tells processes
+    that go by one id, at once or one after the other, apart."""
 
     id: str
     slots: int
     queues: tuple[str, ...]
     has_gpu: bool
+    boot: str = field(default_factory=lambda: secrets.token_hex(4))
+
+    @property
+    def owner(self) -> str:
+        """The name under which it holds leases."""
+        return owner_name(self.id, self.boot)
 
     @classmethod
     def of(cls, worker_id: str, slots: int, queues: Sequence[str], has_gpu: bool) -> WorkerIdentity:
@@ -49,6 +68,16 @@ class WorkerIdentity:
         comes over the queue `cpu`."""
         served = tuple(name for name in queues if has_gpu or name != QUEUE_GPU)
         return cls(worker_id, slots, served, has_gpu)
+
+
+def is_alive(other: Worker) -> bool:
+    """Whether a worker that was seen lately still lives, as far as this machine can tell.
+
+    A process id that is our own is a former self's: in a container every worker has the same.
+    """
+    if other.hostname != socket.gethostname():
+        return True
+    return other.pid != os.getpid() and is_process(other.pid)
 
 
 def num_cores() -> int:
@@ -117,11 +146,9 @@ class WorkerRuntime:
 
     def start(self) -> None:
         """Free what this worker's former self held, and start to keep house."""
-        with self._database.session_scope() as session:
-            freed = release_worker(session, self.identity.id)
+        freed = self._enlist()
         if freed:
             _log.warning("a former self of this worker left: %s", ", ".join(freed))
-        self._register()
         self._prepare()
         self._bell.ring(freed)
         self._housekeeping.start()
@@ -135,7 +162,7 @@ class WorkerRuntime:
             runner.close()
         self._compiler.stop()
         with self._database.session_scope() as session:
-            forget_worker(session, self.identity.id)
+            forget_worker(session, self.identity.id, self.identity.boot)
         self._bell.close()
         self._database.dispose()
 
@@ -168,7 +195,7 @@ class WorkerRuntime:
         mine = [
             stage
             for stage in self._stages
-            if queue_for(stage.needs_gpu, gpu_is_live) in self.identity.queues
+            if queue_for(resource_of(stage.needs_gpu), gpu_is_live) in self.identity.queues
         ]
         for runner in self._runners:
             runner.prepare([stage.name for stage in mine])
@@ -176,55 +203,87 @@ class WorkerRuntime:
         if trains and not self.identity.has_gpu:
             self._compiler.start()
 
+    def _enlist(self) -> list[str]:
+        """Take up the id, and what its former self held; beside one that lives, another id.
+
+        Ids of the stages that became ready.
+        """
+        while True:
+            try:
+                with self._database.session_scope() as session:
+                    other = worker_seen_lately(session, self.identity.id)
+                    if other is not None and is_alive(other):
+                        self._rename()
+                        freed = []
+                    else:
+                        freed = release_worker(session, self.identity.id)
+                    self._enter(session, take_over=True)
+                return freed
+            except IntegrityError:
+                continue  # another process entered the same id at this moment: look at it
+
+    def _rename(self) -> None:
+        mine = self.identity
+        _log.warning("another worker goes by the id %s; this one goes on under its own", mine.id)
+        self.identity = replace(mine, id=f"{mine.id}-{mine.boot}")
+
     def _register(self) -> None:
         with self._database.session_scope() as session:
-            register_worker(
-                session,
-                self.identity.id,
-                hostname=socket.gethostname(),
-                pid=os.getpid(),
-                queues=self.identity.queues,
-                slots=self.identity.slots,
-                has_gpu=self.identity.has_gpu,
-            )
+            if not self._enter(session):
+                self._rename()  # we were away for so long that another took our place
+                self._enter(session)
 
-    def _claim(self, stage_id: str) -> Claim | None:
-        with self._database.session_scope() as session:
-            return claim_stage(session, stage_id, self.identity.id, self._settings.lease_s)
+    def _enter(self, session: Session, take_over: bool = False) -> bool:
+        return register_worker(
+            session,
+            self.identity.id,
+            hostname=socket.gethostname(),
+            pid=os.getpid(),
+            boot=self.identity.boot,
+            queues=self.identity.queues,
+            slots=self.identity.slots,
+            has_gpu=self.identity.has_gpu,
+            take_over=take_over,
+        )
 
-    def _waiting(self, older_than_s: float) -> list[WaitingStage]:
-        """Ready stages that this worker may take now; GPU stages first where it has a GPU."""
-        with self._database.read_scope() as session:
-            waiting = ready_unclaimed(session, older_than_s)
-            gpu_is_live = bool(waiting) and has_live_gpu(session)
-        mine = [
-            stage
-            for stage in waiting
-            if queue_for(stage.needs_gpu, gpu_is_live) in self.identity.queues
-        ]
-        if self.identity.has_gpu:
-            mine.sort(key=lambda stage: not stage.needs_gpu)
-            if self._gpu.locked():
-                mine = [stage for stage in mine if not stage.needs_gpu]
-        return mine
+    def _served(self, session: Session) -> list[str]:
+        """The resources whose stages this worker may take at the moment."""
+        gpu_is_live = has_live_gpu(session)
+        return [name for name in RESOURCES if queue_for(name, gpu_is_live) in self.identity.queues]
 
     def _take(self, wanted: str | None = None) -> _Taken | None:
-        """Claim the wanted stage, or else the next that waits; its GPU is then this slot's."""
+        """Claim the wanted stage, or else the next that waits; its GPU is then this slot's.
+
+        A worker with a GPU takes what needs one first, a slot beside one that has it the rest.
+        """
         if self.shutdown.is_set():
             return None
-        for stage in sorted(self._waiting(0.0), key=lambda stage: stage.id != wanted):
-            on_gpu = stage.needs_gpu and self.identity.has_gpu
-            if on_gpu and not self._gpu.acquire(blocking=False):
-                continue
-            claim: Claim | None = None
-            try:
-                claim = self._claim(stage.id)
-            finally:
-                if on_gpu and claim is None:
-                    self._gpu.release()
-            if claim is not None:
-                return _Taken(claim, on_gpu)
-        return None
+        has_gpu = self.identity.has_gpu and self._gpu.acquire(blocking=False)
+        claim: Claim | None = None
+        try:
+            with self._database.session_scope() as session:
+                served = self._served(session)
+                if self.identity.has_gpu and not has_gpu:
+                    served = [name for name in served if name != RESOURCE_GPU]
+                owner, lease_s = self.identity.owner, self._settings.lease_s
+                if wanted is not None:
+                    claim = claim_stage(session, wanted, owner, lease_s, resources=served)
+                if claim is None:
+                    claim = claim_next(session, self._ranked(served), owner, lease_s)
+        except BaseException:
+            claim = None  # where it was committed all the same, it runs out
+            raise
+        finally:
+            on_gpu = has_gpu and claim is not None and claim.resource == RESOURCE_GPU
+            if has_gpu and not on_gpu:
+                self._gpu.release()
+        return None if claim is None else _Taken(claim, on_gpu)
+
+    def _ranked(self, served: list[str]) -> list[list[str]]:
+        """A GPU serves what needs it first; without one all stages are alike."""
+        if not self.identity.has_gpu:
+            return [served]
+        return [[name for name in served if (name == RESOURCE_GPU) is gpu] for gpu in (True, False)]
 
     def _threads_now(self) -> int:
         """A fair share of the processor for a stage that starts now."""
@@ -234,7 +293,12 @@ class WorkerRuntime:
     def _offer(self) -> None:
         if self._free.empty() or self.shutdown.is_set():
             return
-        waiting = self._waiting(self._settings.direct_after_s)
+        with self._database.read_scope() as session:
+            served = self._served(session)
+            if self._gpu.locked():
+                served = [name for name in served if name != RESOURCE_GPU]
+            older_than_s = self._settings.direct_after_s
+            waiting = ready_unclaimed(session, older_than_s, limit=1, resources=served)
         if not waiting:
             return
         _log.info("taking %s, which nobody came for", waiting[0].id)

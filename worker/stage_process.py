@@ -23,6 +23,7 @@ While nothing is asked of it, it loads the code of the stages that it may be giv
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import faulthandler
 import gc
@@ -85,6 +86,12 @@ def offer_to_oom_killer() -> None:
         return  # not Linux, or not allowed: a preference, no more
 
 
+def forget_peak_memory() -> None:
+    """Have the kernel count the most memory that this process holds anew, for the next run."""
+    with contextlib.suppress(OSError):  # not Linux, or not allowed: then it is that of all runs
+        Path("/proc/self/clear_refs").write_text("5")
+
+
 def error_of(error: BaseException, stage: str) -> dict[str, Any]:
     """What the API will show of an exception. Foreign texts stay out: they may hold paths."""
     if isinstance(error, PipelineError):
@@ -144,6 +151,7 @@ class Run:
 
     def execute(self) -> None:
         """Run the stage and send how it ended."""
+        forget_peak_memory()
         self._messages.send("begun")
         # What stages and libraries that they load for the first time ask (`use_all_cores`).
         os.environ["OMP_NUM_THREADS"] = str(self._command["threads"])

@@ -127,7 +127,9 @@ class JobSummary(BaseModel):
 class JobView(JobSummary):
     """A job."""
 
-    queue_position: int | None = Field(description="1 is served next; null once it runs.")
+    queue_position: int | None = Field(
+        description="1 is served next; 1000 means so many or more; null once it runs."
+    )
     artifacts: list[ArtifactView] = Field(description="What can be downloaded so far.")
 
 

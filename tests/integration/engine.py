@@ -21,6 +21,7 @@ from storage.objects import ObjectStore
 from storage.open_objects import open_object_store
 from storage.queries import get_job
 from storage.records import create_capture, read_logs
+from storage.runs import list_runs
 from storage.schema import upgrade
 from storage.settings import StorageSettings
 from tests.integration.toy_stages import STAGES
@@ -135,6 +136,11 @@ class Engine:
     def stage(self, job_id: str, name: str) -> StageRow:
         """One stage of a job."""
         return next(row for row in self.job(job_id).stages if row.name == name)
+
+    def outcomes(self, job_id: str, name: str) -> list[str | None]:
+        """How the claims of one stage ended, in order."""
+        with self.database.read_scope() as session:
+            return [run.outcome for run in list_runs(session, job_id) if run.stage == name]
 
     def log(self, job_id: str, stage: str | None = None) -> list[str]:
         """The job's log lines."""

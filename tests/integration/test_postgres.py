@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy.orm import Session
 
+from storage.claims import claim_stage
 from storage.db import Database, now
 from storage.jobs import StageSeed, delete_job, stage_id
-from storage.leases import claim_stage, reap_expired, succeed_stage
+from storage.leases import reap_expired, succeed_stage
 from storage.queries import get_job, list_jobs
 from storage.records import append_logs, read_logs
 from storage.schema import upgrade

@@ -22,9 +22,10 @@ from api.app import create_app
 from api.deps import Services
 from api.settings import ApiSettings
 from pipelines.registry import STAGES
+from storage.claims import claim_stage
 from storage.jobs import stage_id
 from storage.keys import attempt_prefix
-from storage.leases import claim_stage, succeed_stage
+from storage.leases import succeed_stage
 from storage.queries import get_job
 from tests.services import free_port
 

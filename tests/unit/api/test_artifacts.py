@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from api.artifacts.ranges import parse_range, tag_listed
 from api.problems import BadRangeError
 from pipelines.registry import STAGES
+from storage.claims import claim_stage
 from storage.jobs import stage_id
 from storage.keys import attempt_prefix
-from storage.leases import FailureReport, claim_stage, fail_stage
+from storage.leases import FailureReport, fail_stage
 from storage.signed_urls import SignedObject, make_object_token
 from tests.unit.api.conftest import Service, finish_job, problem, serving, settings_for
 

@@ -15,10 +15,11 @@ from pathlib import Path
 import httpx
 import pytest
 
+from storage.claims import claim_stage
 from storage.db import Database
 from storage.jobs import StageSeed, stage_id
 from storage.keys import attempt_prefix
-from storage.leases import claim_stage, succeed_stage
+from storage.leases import succeed_stage
 from tests.factories import make_job
 from tests.services import Gate, behind_gate
 from tests.unit.api.conftest import KEY, LEASE_S, problem, serving, settings_for

@@ -8,8 +8,9 @@ import pytest
 
 from pipelines.options import PRESETS, resolve_options
 from pipelines.registry import STAGE_NAMES, STAGES
+from storage.claims import Claim, claim_stage
 from storage.jobs import stage_id
-from storage.leases import Claim, claim_stage, fail_stage, heartbeat
+from storage.leases import fail_stage, heartbeat
 from storage.records import append_logs, register_worker
 from tests.unit.api.conftest import LEASE_S, NUM_ARTIFACTS, Service, finish_job, problem, run_stage
 
@@ -65,7 +66,9 @@ def test_preset_is_preview_without_a_gpu_worker_and_standard_with_one(service: S
     assert job["preset"] == "preview"
     assert "no GPU worker" in job["preset_reason"]
     with service.services.database.session_scope() as session:
-        register_worker(session, "w", hostname="h", pid=1, queues=["gpu"], slots=1, has_gpu=True)
+        register_worker(
+            session, "w", hostname="h", pid=1, boot="b", queues=["gpu"], slots=1, has_gpu=True
+        )
     job = service.job(capture["id"])
     assert job["preset"] == "standard"
     assert "GPU worker" in job["preset_reason"]

@@ -6,14 +6,13 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
+from storage.claims import Claim, claim_stage
 from storage.db import Database
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
 from storage.jobs import StageSeed, create_job, delete_job, request_cancel, stage_id
 from storage.leases import (
-    WORKER_LOST,
-    Claim,
+    CAPS,
     cancel_stage,
-    claim_stage,
     crash_stage,
     fail_stage,
     heartbeat,
@@ -25,10 +24,12 @@ from storage.leases import (
 )
 from storage.models import Event, Job, PendingDeletion, StageRow
 from storage.queries import get_job, is_cancel_requested, list_events, ready_unclaimed, stage_work
+from storage.runs import RunEnd, list_runs
 from tests.factories import DIAMOND, LINE, make_capture, make_job, states
 
 T0 = datetime(2026, 1, 1, tzinfo=UTC)
 ERROR = {"code": "tool_failed", "message": "It broke.", "hint": "Mend it."}
+KILLED = RunEnd("killed", ERROR, -9)
 
 
 def seconds(count: float) -> datetime:
@@ -159,7 +160,7 @@ def test_a_stale_token_can_write_nothing(database: Database) -> None:
     for write in (
         lambda session: succeed_stage(session, stale, manifest={}, output_prefix="p/"),
         lambda session: fail_stage(session, stale, ERROR, retryable=False),
-        lambda session: crash_stage(session, stale, ERROR),
+        lambda session: crash_stage(session, stale, KILLED),
         lambda session: release_stage(session, stale),
         lambda session: cancel_stage(session, stale),
         lambda session: save_checkpoint(session, stale, "c/"),
@@ -226,26 +227,58 @@ def test_a_permanent_error_fails_at_once_and_stops_the_siblings(database: Databa
     }
 
 
-def test_crashes_count_apart_from_errors(database: Database) -> None:
+def end_badly(database: Database, job: str, outcome: str, at: float, saves: bool = False) -> str:
+    """A claim that ends so, after it saved a checkpoint or not. The stage's new state."""
+    held = claim(database, job, "first", at=at)
+    with database.session_scope() as session:
+        if saves:
+            save_checkpoint(session, held, f"c{held.token}/")
+    with database.session_scope() as session:
+        if outcome == "error":
+            return fail_stage(session, held, ERROR, retryable=True, when=seconds(at))
+        if outcome == "released":
+            return release_stage(session, held, when=seconds(at))
+        if outcome == "lost":
+            released = release_worker(session, "w1", when=seconds(at))
+            return "ready" if released == [held.stage_id] else "failed"
+        return crash_stage(session, held, RunEnd(outcome, ERROR), when=seconds(at))
+
+
+@pytest.mark.parametrize(("outcome", "cap"), [*CAPS.items(), ("error", 3)])
+def test_each_cause_has_a_cap_of_its_own(database: Database, outcome: str, cap: int) -> None:
+    """Also after other causes came up to one before theirs."""
     job = new_job(database)
     at = 0.0
-    for crash in (1, 2, 3):
-        held = claim(database, job, "first", at=at)
-        with database.session_scope() as session:
-            state = crash_stage(session, held, WORKER_LOST, when=seconds(at))
-        assert state == ("ready" if crash < 3 else "failed")
-        at += 100.0
-    with database.read_scope() as session:
-        error = get_job(session, job).error
-        assert error is not None
-        assert error["code"] == "worker_lost"
+    for other, most in {**CAPS, "error": 3}.items():
+        for _ in range(0 if other == outcome else most - 1):
+            assert end_badly(database, job, other, at) == "ready"
+            at += 1000.0
+    for count in range(1, cap + 1):
+        assert end_badly(database, job, outcome, at) == ("ready" if count < cap else "failed")
+        at += 1000.0
+    assert look(database, job)["job"] == "failed"
+
+
+def test_a_run_that_got_on_starts_the_counts_anew(database: Database) -> None:
+    job = new_job(database)
+    for number in range(12):
+        assert end_badly(database, job, "killed", number * 1000.0, saves=number % 2 == 1) == "ready"
+    assert end_badly(database, job, "killed", 12_000.0) == "ready"
+    assert end_badly(database, job, "killed", 13_000.0) == "failed"
+
+
+def test_what_is_released_neither_counts_nor_starts_counts_anew(database: Database) -> None:
+    job = new_job(database)
+    ends = ["killed", "released", "killed", "released", "killed"]
+    states_ = [end_badly(database, job, end, at * 1000.0) for at, end in enumerate(ends)]
+    assert states_ == ["ready"] * 4 + ["failed"]
 
 
 def test_the_retry_after_a_first_crash_is_at_once(database: Database) -> None:
     job = new_job(database)
     held = claim(database, job, "first")
     with database.session_scope() as session:
-        crash_stage(session, held, WORKER_LOST, when=seconds(1))
+        crash_stage(session, held, KILLED, when=seconds(1))
     assert claim(database, job, "first", at=1).attempt == 2
 
 
@@ -321,7 +354,7 @@ def test_a_cancelling_job_ends_cancelled_however_its_stage_ends(
         elif end == "fail":
             fail_stage(session, held, ERROR, retryable=True)
         elif end == "crash":
-            crash_stage(session, held, ERROR)
+            crash_stage(session, held, KILLED)
         elif end == "release":
             assert release_stage(session, held) == "cancelled"
         else:
@@ -406,3 +439,65 @@ def test_a_claimed_stage_is_told_its_inputs_and_its_checkpoint(database: Databas
     assert work.checkpoint_prefix == "c2/"
     assert work.inputs["first"].prefix == "p/"
     assert work.inputs["first"].manifest == {"summary": {"n": 1}}
+
+
+ENDS = {
+    "succeed": lambda s, c: succeed_stage(s, c, manifest={}, output_prefix="p/", when=seconds(2)),
+    "fail": lambda s, c: fail_stage(s, c, ERROR, retryable=False, when=seconds(2)),
+    "try again": lambda s, c: fail_stage(s, c, ERROR, retryable=True, when=seconds(2)),
+    "crash": lambda s, c: crash_stage(s, c, KILLED, when=seconds(2)),
+    "release": lambda s, c: release_stage(s, c, when=seconds(2)),
+    "cancel": lambda s, c: cancel_stage(s, c, when=seconds(2)),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_an_end_that_is_recorded_twice_says_the_same_and_changes_nothing(
+    database: Database, end: str
+) -> None:
+    """A worker repeats it where the answer to its COMMIT was lost."""
+    job = new_job(database)
+    held = claim(database, job, "first")
+    with database.session_scope() as session:
+        first = ENDS[end](session, held)
+    before = look(database, job)
+    with database.session_scope() as session:
+        events = len(list_events(session, job))
+        assert ENDS[end](session, held) == first
+        assert len(list_events(session, job)) == events
+    assert look(database, job) == before
+
+
+def test_an_end_recorded_by_another_is_no_end_of_ours(database: Database) -> None:
+    job = new_job(database)
+    held = claim(database, job, "first")
+    with database.session_scope() as session:
+        reap_expired(session, when=seconds(61))
+    for end in ENDS.values():
+        with pytest.raises(LostLeaseError), database.session_scope() as session:
+            end(session, held)
+
+
+def test_history_keeps_what_a_later_claim_overwrites(database: Database) -> None:
+    job = new_job(database)
+    held = claim(database, job, "first", owner="w1")
+    with database.session_scope() as session:
+        crash_stage(session, held, RunEnd("out_of_memory", ERROR, -9, 2**33), when=seconds(3))
+    succeed(database, claim(database, job, "first", at=4, owner="w2"), at=5)
+    with database.read_scope() as session:
+        runs = list_runs(session, job)
+        events = list_events(session, job)
+    assert [(run.owner, run.outcome, run.led_to) for run in runs] == [
+        ("w1", "out_of_memory", "ready"),
+        ("w2", "succeeded", "succeeded"),
+    ]
+    assert (runs[0].error, runs[0].exit_code, runs[0].peak_bytes) == (ERROR, -9, 2**33)
+    assert (runs[0].started_at, runs[0].finished_at) == (seconds(0), seconds(3))
+    told = [(event.kind, event.actor, event.reason) for event in events if event.stage == "first"]
+    assert told == [
+        ("stage.ready", "service", ""),
+        ("stage.running", "worker:w1", ""),
+        ("stage.ready", "worker:w1", "tool_failed"),
+        ("stage.running", "worker:w2", ""),
+        ("stage.succeeded", "worker:w2", ""),
+    ]

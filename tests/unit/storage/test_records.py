@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from storage import api_keys
+from storage.claims import Claim, claim_stage
 from storage.db import Database
 from storage.deletions import drain_deletions
 from storage.errors import ConflictError, InvalidCursorError, NotFoundError
 from storage.jobs import request_cancel, stage_id
-from storage.leases import Claim, claim_stage
 from storage.models import ApiKey, Capture
 from storage.objects_local import LocalObjectStore
 from storage.queries import get_job, list_captures, list_jobs, queue_position
@@ -120,7 +120,7 @@ def test_the_log_of_a_stage_is_bounded(database: Database) -> None:
 
 def test_a_gpu_counts_while_its_worker_is_live_and_serves_gpu_stages(database: Database) -> None:
     with database.session_scope() as session:
-        common = {"hostname": "h", "pid": 1, "slots": 1}
+        common = {"hostname": "h", "pid": 1, "boot": "b0", "slots": 1}
         register_worker(session, "a", queues=["cpu"], has_gpu=True, when=T0, **common)  # type: ignore[arg-type]
         assert not has_live_gpu(session, T0)
         register_worker(session, "b", queues=["gpu"], has_gpu=True, when=T0, **common)  # type: ignore[arg-type]
@@ -135,14 +135,16 @@ def test_a_gpu_counts_while_its_worker_is_live_and_serves_gpu_stages(database: D
             **common,  # type: ignore[arg-type]
         )
         assert [row.id for row in live_workers(session, T0 + timedelta(seconds=61))] == ["b"]
-        forget_worker(session, "b")
+        forget_worker(session, "b", "another boot")
+        assert has_live_gpu(session, T0)
+        forget_worker(session, "b", "b0")
         assert not has_live_gpu(session, T0)
 
 
 def test_gpu_stages_go_to_cpu_workers_where_no_gpu_is() -> None:
-    assert queue_for(needs_gpu=True, gpu_is_live=False) == QUEUE_CPU
-    assert queue_for(needs_gpu=True, gpu_is_live=True) == QUEUE_GPU
-    assert queue_for(needs_gpu=False, gpu_is_live=True) == QUEUE_CPU
+    assert queue_for("gpu", gpu_is_live=False) == QUEUE_CPU
+    assert queue_for("gpu", gpu_is_live=True) == QUEUE_GPU
+    assert queue_for("cpu", gpu_is_live=True) == QUEUE_CPU
 
 
 def test_a_capture_stays_while_a_job_runs_on_it_and_then_its_bytes_go(

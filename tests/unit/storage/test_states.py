@@ -10,13 +10,12 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from storage.claims import Claim, claim_stage
 from storage.db import Database
 from storage.errors import LostLeaseError
 from storage.jobs import request_cancel, stage_id
 from storage.leases import (
-    Claim,
     cancel_stage,
-    claim_stage,
     crash_stage,
     fail_stage,
     heartbeat,
@@ -26,6 +25,7 @@ from storage.leases import (
     succeed_stage,
 )
 from storage.models import Event
+from storage.runs import RunEnd
 from storage.states import (
     JOB_LIVE,
     JOB_TERMINAL,
@@ -96,7 +96,7 @@ class AnyOrder(RuleBasedStateMachine):
             ),
             "fail": lambda s: fail_stage(s, claim, ERROR, retryable=False, when=self.when),
             "retry": lambda s: fail_stage(s, claim, ERROR, retryable=True, when=self.when),
-            "crash": lambda s: crash_stage(s, claim, ERROR, when=self.when),
+            "crash": lambda s: crash_stage(s, claim, RunEnd("killed", ERROR), when=self.when),
             "release": lambda s: release_stage(s, claim, when=self.when),
             "cancel": lambda s: cancel_stage(s, claim, when=self.when),
         }

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from storage.bell import Bell
+from storage.claims import claim_stage
 from storage.jobs import request_cancel, stage_id
-from storage.leases import cancel_stage, claim_stage
+from storage.leases import cancel_stage
 from storage.models import PendingDeletion, StageRow
 from storage.objects_local import LocalObjectStore
 from storage.open_objects import open_object_store
@@ -30,7 +31,7 @@ NO_BROKER = "redis://127.0.0.1:1/0"
 
 def waiting(rung_after_s: float | None) -> WaitingStage:
     rung = None if rung_after_s is None else T0 + timedelta(seconds=rung_after_s)
-    return WaitingStage("s", False, T0, rung)
+    return WaitingStage("s", "cpu", T0, rung)
 
 
 @pytest.mark.parametrize(

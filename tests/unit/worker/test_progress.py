@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from storage.claims import Claim, claim_stage
 from storage.db import Database
 from storage.jobs import request_cancel, stage_id
-from storage.leases import Claim, claim_stage, release_worker
+from storage.leases import release_worker
 from storage.models import StageRow
 from storage.records import read_logs
 from tests.factories import make_database, make_job

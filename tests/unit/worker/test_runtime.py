@@ -6,6 +6,9 @@ Real stage processes and a real database; no broker.
 from __future__ import annotations
 
 import json
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -14,8 +17,12 @@ from pathlib import Path
 import pytest
 
 from deploy.embedded import free_port
+from storage.claims import claim_stage
+from storage.jobs import stage_id
+from storage.leases import owner_name
 from storage.models import StageRow
-from tests.integration.engine import Engine
+from storage.records import live_workers, register_worker
+from tests.integration.engine import Engine, is_running
 from worker.__main__ import MANY_CORES, default_slots, parse_arguments
 from worker.runtime import WorkerIdentity, WorkerRuntime
 from worker.settings import WorkerSettings
@@ -147,3 +154,72 @@ def test_timings_of_a_stage_cover_its_claim(engine: Engine) -> None:
     assert timings["load_s"] + timings["compile_s"] <= timings["wall_s"] <= timings["run_s"]
     assert timings["run_s"] >= SECOND["steps"] * SECOND["step_s"]
     assert 0.0 < parts <= (ended - begun).total_seconds() + 0.01
+
+
+@pytest.mark.parametrize("lives", [True, False])
+def test_only_a_former_self_that_is_dead_is_robbed(engine: Engine, lives: bool) -> None:
+    """A second worker that is started under the id of one that lives goes on under its own."""
+    job = engine.submit({}, ring=False)
+    first = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        with engine.database.session_scope() as session:
+            register_worker(
+                session,
+                "w",
+                hostname=socket.gethostname(),
+                pid=first.pid,
+                boot="first",
+                queues=["cpu"],
+                slots=1,
+                has_gpu=False,
+            )
+            owner = owner_name("w", "first")
+            assert claim_stage(session, stage_id(job, "ingest"), owner, 60.0) is not None
+        if not lives:
+            first.kill()  # and nobody has buried it yet
+            engine.wait(lambda: not is_running(first.pid), 10)
+        settings = WorkerSettings(prepare=False, tick_s=60.0, direct_after_s=60.0)
+        identity = WorkerIdentity("w", 1, ("cpu",), False)
+        runtime = WorkerRuntime(identity, engine.settings, settings, registry=TOYS)
+        runtime.start()
+        try:
+            assert runtime.identity.id == ("w-" + identity.boot if lives else "w")
+            assert engine.stage(job, "ingest").state == ("running" if lives else "ready")
+            assert engine.outcomes(job, "ingest") == [None if lives else "lost"]
+        finally:
+            runtime.close()
+        with engine.database.read_scope() as session:
+            assert [row.id for row in live_workers(session)] == (["w"] if lives else [])
+    finally:
+        first.kill()
+        first.wait()
+
+
+def test_a_worker_whose_place_was_taken_while_it_slept_goes_on_under_another_id(
+    engine: Engine,
+) -> None:
+    settings = WorkerSettings(prepare=False, tick_s=0.1, direct_after_s=60.0)
+    identity = WorkerIdentity("w", 1, ("cpu",), False)
+    runtime = WorkerRuntime(identity, engine.settings, settings, registry=TOYS)
+    runtime.start()
+    try:
+        newer = {"queues": ["cpu"], "slots": 1, "has_gpu": False}
+        with engine.database.session_scope() as session:
+            register_worker(
+                session,
+                "w",
+                hostname="far",
+                pid=1,
+                boot="newer",
+                take_over=True,
+                **newer,  # type: ignore[arg-type]
+            )
+        mine = f"w-{identity.boot}"
+
+        def workers_now() -> dict[str, str]:
+            with engine.database.read_scope() as session:
+                return {row.id: row.boot for row in live_workers(session)}
+
+        engine.wait(lambda: workers_now() == {"w": "newer", mine: identity.boot}, 10)
+    finally:
+        runtime.close()

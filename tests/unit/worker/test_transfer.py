@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from pipelines.workspace import Workspace
+from storage.claims import Claim, claim_stage
 from storage.errors import ObjectStoreError, ObjectStoreFullError
 from storage.jobs import stage_id
-from storage.leases import Claim, claim_stage
 from storage.models import StageRow
 from storage.objects import OnBytes
 from storage.objects_local import LocalObjectStore
@@ -182,17 +182,20 @@ def test_errors_around_a_stage_have_codes_that_people_can_act_on() -> None:
 
 
 @pytest.mark.parametrize(
-    ("status", "out_of_memory", "code"),
+    ("status", "out_of_memory", "cause", "code"),
     [
-        (-9, True, "out_of_memory"),
-        (-9, False, "worker_lost"),
-        (137, False, "worker_lost"),
-        (-11, False, "stage_crashed"),
-        (1, False, "stage_crashed"),
+        (-9, True, "out_of_memory", "out_of_memory"),
+        (-9, False, "killed", "worker_lost"),
+        (137, False, "killed", "worker_lost"),
+        (-11, False, "crashed", "stage_crashed"),
+        (1, False, "crashed", "stage_crashed"),
     ],
 )
-def test_an_exit_status_says_what_happened(status: int, out_of_memory: bool, code: str) -> None:
-    assert crash_of("train", status, out_of_memory).error["code"] == code
+def test_an_exit_status_says_what_happened(
+    status: int, out_of_memory: bool, cause: str, code: str
+) -> None:
+    crash = crash_of("train", status, out_of_memory)
+    assert (crash.cause, crash.error["code"], crash.exit_code) == (cause, code, status)
 
 
 def test_a_stage_process_sees_no_keys_of_the_service() -> None:

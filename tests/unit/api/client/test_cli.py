@@ -28,8 +28,9 @@ from api.client.display import (
     watch_job,
 )
 from pipelines.options import PRESETS
+from storage.claims import claim_stage
 from storage.jobs import stage_id
-from storage.leases import claim_stage, fail_stage, heartbeat
+from storage.leases import fail_stage, heartbeat
 from storage.records import append_logs
 from tests.services import free_port
 from tests.unit.api.conftest import (
