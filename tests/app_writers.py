@@ -232,3 +232,66 @@ def write_llff(
             file = names[index].replace("images", "images_4").replace("jpg", "png")
             archive.writestr(file, png(picture[::4, ::4]))
     return named(truth, names)
+
+
+def write_nerfcapture(path: Path, num: int = 5, width: int = 160) -> CamerasFile:
+    """NeRFCapture's offline dataset: pictures without a suffix in the list, a lens a frame.
+
+    Depth is what its first releases wrote: drawn as a picture of four channels.
+    """
+    truth = breathing(walk(num, landscape_camera(width), frame_rate=2.0))
+    names = {index: f"240223175130/images/{index}.png" for index in range(num)}
+    frames = []
+    with zipfile.ZipFile(path, "w") as archive:
+        for index, image in enumerate(truth.images):
+            lens, pose = truth.cameras[image.camera], pose_matrix(image)
+            frames.append(
+                {
+                    "file_path": f"images/{index}",
+                    "depth_path": f"images/{index}.depth.png",
+                    "transform_matrix": np.vstack([arkit_pose(pose), [0, 0, 0, 1]]).tolist(),
+                    "timestamp": _CLOCK_S + index / 2.0,
+                    **_own_lens(lens),
+                }
+            )
+            picture = shown(truth, image)
+            archive.writestr(names[index], png(picture))
+            drawn = np.concatenate([picture, np.full_like(picture[..., :1], 255)], axis=2)
+            archive.writestr(names[index].replace(".png", ".depth.png"), png(drawn))
+        top = {**_own_lens(truth.cameras[0]), "depth_integer_scale": 1, "frames": frames}
+        archive.writestr("240223175130/transforms.json", json.dumps(top))
+    return named(truth, names)
+
+
+def _own_lens(lens: Intrinsics) -> dict[str, float]:
+    """Keys of `transforms.json`, ARKit's values: pixel centres at integers."""
+    return {
+        "w": lens.width,
+        "h": lens.height,
+        "fl_x": lens.fl_x,
+        "fl_y": lens.fl_y,
+        "cx": lens.cx - 0.5,
+        "cy": lens.cy - 0.5,
+    }
+
+
+def write_kiri(path: Path, num: int = 5, width: int = 160) -> CamerasFile:
+    """KIRI Engine's camera poses: nerfstudio's layout, of structure from motion."""
+    truth = replace(walk(num, landscape_camera(width)), metric=False)
+    (lens,) = truth.cameras
+    names = {index: f"My scan/images/{index + 1:05d}.jpg" for index in range(num)}
+    frames = [
+        {
+            "file_path": names[index].removeprefix("My scan/"),
+            "transform_matrix": np.vstack([pose_matrix(image), [0, 0, 0, 1]]).tolist(),
+        }
+        for index, image in enumerate(truth.images)
+    ]
+    top: dict[str, Any] = {"camera_model": "OPENCV", "w": lens.width, "h": lens.height}
+    top |= {"fl_x": lens.fl_x, "fl_y": lens.fl_y, "cx": lens.cx, "cy": lens.cy}
+    top |= dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("My scan/transforms.json", json.dumps({**top, "frames": frames}))
+        for index, image in enumerate(truth.images):
+            archive.writestr(names[index], jpeg(shown(truth, image)))
+    return named(truth, names)

@@ -4,11 +4,12 @@ Instant NGP, nerfstudio and the Blender scenes of NeRF write it, each with keys 
 top or in a frame: fl_x fl_y cx cy w h, k1..k4 p1 p2 or distortion_params (k1 k2 k3 k4 p1 p2),
 camera_angle_x/y (radians) in place of focal lengths, camera_model, is_fisheye. In a frame:
 file_path, transform_matrix (world_from_camera, OpenGL camera), mask_path, timestamp or time,
-depth_file_path. Standard library only.
+depth_file_path (nerfstudio's) or depth_path (Instant NGP's). Standard library only.
 
 Depth is counts along the camera's axis; a count is depth_unit_scale_factor (at the top or in the
 frame, 0.001 without it) units of the original world, and applied_scale, where the file has it, has
 brought the poses from that world to the file's: nerfstudio multiplies depth by both, and so do we.
+A count of depth_path is integer_depth_scale units of the file's world, and means nothing without.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class Frame:
     @property
     def depth_path(self) -> str:
         """Where its depth should be, or ""."""
-        return self._path("depth_file_path")
+        return self._path("depth_file_path") or self._path("depth_path")
 
     def _path(self, key: str) -> str:
         path = self.own.get(key)
@@ -210,7 +211,7 @@ def _depths(
     for name, frame in wanted.items():
         if depth := names.get(frame.depth_path):
             try:
-                depths[name] = SensorDepth(depth, _depth_unit(frame.values, file))
+                depths[name] = SensorDepth(depth, _depth_unit(frame, file))
             except CaptureError as error:
                 faults.append(error.message)
                 archive.told([depth])
@@ -233,13 +234,15 @@ def _depths(
     return _Depths(depths, frozenset(names.values()), warnings)
 
 
-def _depth_unit(values: Values, file: str) -> float:
+def _depth_unit(frame: Frame, file: str) -> float:
     """World units per count of a depth map. Raises CaptureError poses_malformed."""
-    key = "depth_unit_scale_factor"
-    unit = number(values.get(key, DEFAULT_DEPTH_UNIT), f"{key} of {file}")
+    key, unknown, values = "depth_unit_scale_factor", DEFAULT_DEPTH_UNIT, frame.values
     scale = number(values.get("applied_scale", 1.0), f"applied_scale of {file}")
+    if "depth_file_path" not in frame.own:
+        key, unknown, scale = "integer_depth_scale", 0.0, 1.0
+    unit = number(values.get(key, unknown), f"{key} of {file}")
     if unit <= 0 or scale <= 0:
-        raise malformed(f"{key} or applied_scale of {file} is not above 0.")
+        raise malformed(f"{key} or applied_scale of {file} is missing or not above 0.")
     return unit * scale
 
 

@@ -6,22 +6,31 @@ The file's world is kept as it is and taken as +Z up, unless the pictures clearl
 of its axes is, and `orientation_override` does not forbid a turn: +Z is nerfstudio's own
 convention, and what `applied_transform` has led to. That, a turn in it, and `applied_scale` are
 written down in the notes. Nothing says that its unit is the metre, also where there is depth.
+
+KIRI Engine writes this layout as it is. NeRFCapture does too, and says more than it writes: its
+files alone have `depth_integer_scale`, and then the world is ARKit's, metres, +Y up, and pixel
+centres are at integers. The depth it keeps beside its pictures has four channels of 8 bits, or is
+not there at all: it is not used. No real export of either was at hand: of NeRFCapture's the public
+source was, of KIRI's nerfstudio's word.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-from pipelines.captures.contents import PosedPictures
+from pipelines.captures.contents import PosedPictures, PosedSource
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.named_files import NamedFiles
-from pipelines.captures.parsing import malformed, number, numbers
+from pipelines.captures.parsing import malformed, number, numbers, z_up_from_y_up
 from pipelines.captures.transforms_json import Values, read_frames, read_transforms
 from pipelines.captures.unpack import CaptureArchive
 
 _FILE = "transforms.json"
 _ORIENTATION = "orientation_override"
 """Of nerfstudio: how to turn the world; "none" says that it is upright as it is."""
+_OF_NERFCAPTURE = "depth_integer_scale"
+_PIXEL_CENTRE = 0.5
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 
@@ -37,16 +46,22 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     Raises CaptureError: poses_missing, poses_malformed.
     """
     top, frames = read_transforms(archive, claim.root + _FILE)
+    is_arkit = _OF_NERFCAPTURE in top
+    if is_arkit:
+        top, frames = _centred(top), [_centred(frame) for frame in frames]
     listed = read_frames(archive, claim.root, _FILE, [(top, frame) for frame in frames], True)
     unlisted = archive.images - listed.named
     unread = _unread(archive, claim.root, top)
     archive.set_aside(unlisted, f"not listed in {_FILE}")
+    sources = listed.sources
+    if is_arkit:
+        sources = [_turned(source) for source in sources]
     return PosedPictures(
-        sources=listed.sources,
+        sources=sources,
         failures=listed.failures,
-        metric=False,
-        up="known" if top.get(_ORIENTATION) == "none" else "assumed",
-        notes=_notes(top),
+        metric=is_arkit,
+        up="known" if is_arkit or top.get(_ORIENTATION) == "none" else "assumed",
+        notes={"world": "ARKit, turned to +Z up"} if is_arkit else _notes(top),
         details={
             "num_listed": len(frames),
             "num_missing": listed.num_missing,
@@ -54,6 +69,25 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         },
         warnings=[*listed.warnings, *unread],
     )
+
+
+def _centred(values: Any) -> Any:
+    """Keys of the top or of a frame, with the principal point of pixels whose centre is at 0.5.
+
+    What is no number stays as it is: whoever reads it says so."""
+    if not isinstance(values, dict):
+        return values
+    moved = {
+        key: values[key] + _PIXEL_CENTRE
+        for key in ("cx", "cy")
+        if isinstance(values.get(key), float | int)
+    }
+    return {**values, **moved}
+
+
+def _turned(source: PosedSource) -> PosedSource:
+    """A picture in ARKit's world, in ours."""
+    return replace(source, world_from_camera=z_up_from_y_up(source.world_from_camera))
 
 
 def _unread(archive: CaptureArchive, root: str, top: Values) -> list[str]:

@@ -436,3 +436,44 @@ def test_a_file_that_says_it_is_upright_is_believed(tmp_path: Path) -> None:
     summary, ctx = ingest(tmp_path, lying(orientation_override="none"))
     assert not any("turned" in warning for warning in summary["warnings"])
     assert "up" not in cameras(ctx).notes
+
+
+# --- the same keys from others ----------------------------------------------------------------
+
+
+def instant_ngp(count: int = 4, **top: Any) -> dict[str, bytes | str]:
+    """Depth as Instant NGP's keys name it."""
+    frames = json.loads(str(nerfstudio_files(count)["transforms.json"]))["frames"]
+    for n, frame in enumerate(frames):
+        frame["depth_path"] = f"images/{n}.depth.png"
+    files = nerfstudio_files(count, frames=frames, **top)
+    return files | {f"images/{n}.depth.png": depth_png(COUNTS) for n in range(count)}
+
+
+def test_depth_of_instant_ngp_is_in_the_files_unit(tmp_path: Path) -> None:
+    """4 m to the full range, as scripts for NeRFCapture write it; applied_scale is not its key."""
+    summary, ctx = ingest(tmp_path, instant_ngp(integer_depth_scale=4 / 65535, applied_scale=3.0))
+    assert (summary["num_depths"], summary["metric"]) == (4, False)
+    np.testing.assert_allclose(depth_of(ctx, 1), COUNTS * (4 / 65535), rtol=1e-6)
+
+
+@pytest.mark.parametrize("top", [{}, {"integer_depth_scale": -1}, {"integer_depth_scale": "4"}])
+def test_depth_of_instant_ngp_means_nothing_without_its_unit(
+    tmp_path: Path, top: dict[str, Any]
+) -> None:
+    summary, _ = ingest(tmp_path, instant_ngp(**top))
+    assert (summary["num_posed"], summary["num_depths"]) == (4, 0)
+    assert warning_with(summary, "4 depth maps are not used", "integer_depth_scale")
+
+
+def test_nerfcapture_is_known_by_its_key(tmp_path: Path) -> None:
+    """ARKit's world: +Y up, metres, whatever the pictures show."""
+    summary, ctx = ingest(tmp_path, instant_ngp(depth_integer_scale=1))
+    assert (summary["metric"], summary["num_depths"]) == (True, 0)
+    file = cameras(ctx)
+    assert [image.world_from_camera[1][3] for image in file.images] == [0, 1, 2, 3]
+    assert (file.cameras[0].cx, file.cameras[0].cy) == (31.5, 23.5)
+    for key in ("cx", "cy"):
+        broken: dict[str, Any] = {"depth_integer_scale": 1, key: "x"}
+        code = code_of(tmp_path / key, instant_ngp(**broken))
+        assert code == "poses_malformed"

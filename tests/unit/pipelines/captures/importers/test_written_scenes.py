@@ -16,7 +16,9 @@ from pipelines.sample.scene import pose_matrix
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.stages.ingest import run
 from tests.app_writers import (
+    write_kiri,
     write_llff,
+    write_nerfcapture,
     write_replica,
     write_rgbd_list,
     write_scanner_app,
@@ -37,6 +39,8 @@ Write = Callable[..., CamerasFile]
         ("rgbd", write_scannet),
         ("rgbd", write_replica),
         ("rgbd", write_rgbd_list),
+        ("nerfstudio", write_nerfcapture),
+        ("nerfstudio", write_kiri),
         ("llff", write_llff),
         ("llff", partial(write_llff, as_text=False)),
     ],
