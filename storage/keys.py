@@ -38,3 +38,13 @@ def attempt_prefix(job_id: str, stage: str, attempt: int, token: int) -> str:
 def checkpoint_prefix(job_id: str, stage: str, token: int, number: int) -> str:
     """One checkpoint: the claim's token and its number within the claim."""
     return f"{stage_prefix(job_id, stage)}checkpoint/{token}-{number}/"
+
+
+def token_of(key: str) -> int | None:
+    """The token of the claim that wrote this object of a stage; None for other keys."""
+    parts = key.split("/")
+    if len(parts) < 5 or parts[0] != "jobs":
+        return None
+    first, _, second = (parts[4] if parts[3] == "checkpoint" else parts[3]).partition("-")
+    token = first if parts[3] == "checkpoint" else second
+    return int(token) if token.isdecimal() else None

@@ -1,7 +1,8 @@
 """Uploads checkpoints beside a running stage: the latest only, replaced as a whole.
 
 Order: the new one is uploaded under a prefix of its own, then the stage's row names it (under the
-fencing token), then the old one is deleted. At each moment the row names a complete checkpoint.
+fencing token), then, after the COMMIT, the old one is deleted. At each moment the row names a
+complete checkpoint, also where nobody knows whether a COMMIT was applied.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from storage import keys
 from storage.claims import Claim
 from storage.db import Database
-from storage.errors import LostLeaseError, StorageError
+from storage.errors import LostLeaseError, ObjectStoreError, StorageError
 from storage.leases import save_checkpoint
 from storage.objects import ObjectStore
 from worker.transfer import upload_folder
@@ -118,14 +119,18 @@ class CheckpointUploader:
         claim = self._claim
         self._number += 1
         prefix = keys.checkpoint_prefix(claim.job_id, claim.name, claim.token, self._number)
-        stale: str | None = prefix
         try:
             upload_folder(self._store, snapshot.folder, prefix, self._check, workers=self._workers)
             if not snapshot.is_intact():
-                _log.error("%s writes into checkpoint files instead of replacing them", claim.name)
-                return
+                raise ObjectStoreError(f"{claim.name} wrote into files instead of replacing them")
             with self._database.session_scope() as session:
-                stale = save_checkpoint(session, claim, prefix)
-        finally:
-            if stale is not None:
-                self._store.delete_prefix(stale)
+                old = save_checkpoint(session, claim, prefix)
+        except SQLAlchemyError:
+            # The COMMIT may have been applied: nobody knows which of the two the row names, so both
+            # stay. The next checkpoint replaces the one, the stage's success drops the other.
+            raise
+        except Exception:
+            self._store.delete_prefix(prefix)  # the row does not name it, and will not
+            raise
+        if old is not None:
+            self._store.delete_prefix(old)

@@ -15,6 +15,7 @@ import importlib.metadata
 import logging
 import os
 import shutil
+import socket
 import subprocess
 import threading
 import time
@@ -63,6 +64,29 @@ def is_ring_due(stage: WaitingStage, moment: datetime, again_s: float) -> bool:
     return moment - stage.rung_at >= timedelta(seconds=max(again_s, waited_s))
 
 
+class Grace:
+    """When a reaper may believe what it sees.
+
+    A machine that slept, or was stopped, wakes with every lease on it run out, its own and those of
+    the workers beside it, which live and have not yet had the time to say so. So a reaper that
+    finds a gap behind itself that could have cost a lease waits until all had their turn.
+    """
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        self._gap = timedelta(seconds=max(settings.lease_s - settings.heartbeat_s, 0.0) / 2.0)
+        self._pause = timedelta(seconds=max(settings.tick_s, 2.0 * settings.heartbeat_s))
+        self._last: datetime | None = None
+        self._until: datetime | None = None
+
+    def is_over(self, moment: datetime) -> bool:
+        """To be asked every round, by the clock that leases go by."""
+        if self._last is not None and moment - self._last > max(self._gap, self._pause):
+            self._until = moment + self._pause
+            _log.warning("away for %.0f s: leases get some grace", (moment - self._last).seconds)
+        self._last = moment
+        return self._until is None or moment >= self._until
+
+
 class Housekeeping:
     """Two threads: one asks the database alone, so that it is on time whatever else hangs; one
     cleans, which may wait for the object store.
@@ -86,6 +110,7 @@ class Housekeeping:
         self._bell = bell
         self._settings = settings
         self._work_dir = work_dir
+        self._grace = Grace(settings)
         self._stopped = threading.Event()
         self._threads = [
             threading.Thread(
@@ -124,9 +149,10 @@ class Housekeeping:
             self._stopped.wait(pause_s)
 
     def reap(self) -> None:
-        """Take back stages whose leases ran out."""
-        with self._database.session_scope() as session:
-            ready = reap_expired(session)
+        """Take back stages whose leases ran out; not at once where we ourselves were away."""
+        with self._database.session_scope(f"reaper:{socket.gethostname()}") as session:
+            moment = now(session)
+            ready = reap_expired(session, moment) if self._grace.is_over(moment) else []
         if ready:
             _log.warning("lost their workers: %s", ", ".join(ready))
             self._bell.ring(ready)

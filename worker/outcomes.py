@@ -8,6 +8,12 @@ from typing import Any
 
 from pipelines.errors import PipelineError, ResourceError
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
+from worker.locks import FolderInUseError
+
+
+class UnknownOutcomeError(Exception):
+    """The database did not say whether it recorded the end of an attempt: nothing may be deleted,
+    for the row may name it. What nothing names is swept up later."""
 
 
 class StopRunError(Exception):
@@ -75,6 +81,15 @@ def time_limit_of(stage: str, limit_s: float) -> StageCrashedError:
     return StageCrashedError("time_limit", error.as_dict())
 
 
+def folder_in_use(stage: str) -> dict[str, Any]:
+    """Another process works in the stage's folder on this machine."""
+    return ResourceError(
+        f"Another process still runs {stage} in the same folder.",
+        code="folder_in_use",
+        hint="Look at the worker's log for a process that does not end; then retry the job.",
+    ).as_dict()
+
+
 def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
     """What an exception in the worker around the stage means, as an error of the stage."""
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -84,6 +99,8 @@ def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
             code="disk_full",
             hint="Free some space on the worker's disk or the object store; then retry the job.",
         ).as_dict()
+    if isinstance(error, FolderInUseError):
+        return folder_in_use(stage)
     if isinstance(error, ObjectMissingError):
         return PipelineError(
             f"A file that {stage} needs is no longer stored.",

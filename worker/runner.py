@@ -1,7 +1,8 @@
 """One attempt of one stage: fetch inputs, run it in the slot's process, publish, record.
 
-Whatever happens ends in exactly one operation of `storage.leases`; one that comes too late, because
-the lease was lost, is refused there, and what was uploaded is deleted again.
+Whatever happens ends in exactly one operation of `storage.leases`, repeated until the database has
+answered: one that comes too late, because the lease was lost, is refused, and only then is what was
+uploaded deleted. A worker that must end before it has an answer leaves everything as it is.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
 from pipelines.stage import Stage
@@ -42,10 +43,12 @@ from worker.outcomes import (
     StageCrashedError,
     StageFailedError,
     StopRunError,
+    UnknownOutcomeError,
     crash_of,
     failure_of,
     time_limit_of,
 )
+from worker.predecessors import end_predecessor
 from worker.process import StageProcess
 from worker.progress import LeaseKeeper
 from worker.settings import WorkerSettings
@@ -157,22 +160,25 @@ class Runner:
                     peak_bytes=self._peak_bytes,
                 )
             except Exception as error:  # noqa: BLE001 every end of an attempt is recorded
-                self._discard(prefix)
+                self._discard(claim, prefix)  # the database was never told of it
                 record = self._record_of(claim, error, prefix)
             keeper.flush()
             try:
                 ready = self._record(record)
+            except UnknownOutcomeError:
+                _log.warning("%s: nobody knows whether its end was recorded", claim.stage_id)
+                return []
             except (LostLeaseError, NotFoundError):
                 _log.warning("%s: lease lost, work thrown away", claim.stage_id)
-                self._discard(prefix)
+                self._discard(claim, prefix)
                 return []
         if not isinstance(ready, list):
             if ready != "failed":
-                self._discard(prefix)
+                self._discard(claim, prefix)
             _log.info("%s: %s", claim.stage_id, ready or "cancelled")
             return []
         _log.info("%s: succeeded", claim.stage_id)
-        self._discard(keys.stage_prefix(claim.job_id, claim.name), keep=prefix)
+        self._discard(claim, keys.stage_prefix(claim.job_id, claim.name), keep=prefix)
         return ready
 
     def _guard_of(self, keeper: LeaseKeeper) -> Callable[[], None]:
@@ -193,6 +199,7 @@ class Runner:
         with self._database.read_scope() as session:
             work = stage_work(session, claim)
         workspace = Workspace(self._work_dir / claim.job_id)
+        end_predecessor(workspace.root, stage.name, claim.token)
         write_job_file(workspace, work)
         if self._is_near_the_capture(stage):
             fetch_capture(self._store, workspace, work, guard)
@@ -253,6 +260,7 @@ class Runner:
                 keeper.log,
                 do="run",
                 stage=stage.name,
+                token=claim.token,
                 options=work.options,
                 root=str(workspace.root),
                 seed=work.seed,
@@ -367,7 +375,11 @@ class Runner:
         return publish_failure(self._database, self._store, claim, self._work_dir, error, prefix)
 
     def _record(self, operation: Callable[[Session], Result]) -> Result:
-        """Run a closing operation, again while the database is away and the lease may hold."""
+        """Run a closing operation until the database answers: it can be repeated.
+
+        Raises what the operation raises, the database's own refusal; UnknownOutcomeError where the
+        worker ends first, or the database fails in another way for as long as a lease lasts.
+        """
         deadline = time.monotonic() + self._settings.lease_s
         while True:
             try:
@@ -375,17 +387,28 @@ class Runner:
                     return operation(session)
             except SQLAlchemyError as error:
                 _log.warning("the end of a stage waits for the database: %s", error)
-                if time.monotonic() > deadline or self._shutdown.wait(RECORD_STEP_S):
-                    raise LostLeaseError("the database does not answer") from error
+                given_up = not _is_away(error) and time.monotonic() > deadline
+                if given_up or self._shutdown.wait(RECORD_STEP_S):
+                    raise UnknownOutcomeError from error
 
-    def _discard(self, prefix: str, keep: str | None = None) -> None:
-        """Delete what an attempt that does not count has uploaded."""
+    def _discard(self, claim: Claim, prefix: str, keep: str | None = None) -> None:
+        """Delete what attempts that do not count have uploaded, up to this one.
+
+        What a later claim writes stays: this worker may have slept while the job was retried.
+        """
         try:
             for key in list(self._store.list(prefix)):
-                if keep is None or not key.startswith(keep):
+                token = keys.token_of(key)
+                is_later = token is not None and token > claim.token
+                if not is_later and (keep is None or not key.startswith(keep)):
                     self._store.delete(key)
         except StorageError as error:
             _log.warning("left behind below %s: %s", prefix, error)
+
+
+def _is_away(error: SQLAlchemyError) -> bool:
+    """Whether the database cannot be reached, or has no time: it may answer later."""
+    return isinstance(error, OperationalError | InterfaceError | TimeoutError)
 
 
 def _raise(error: Exception) -> None:

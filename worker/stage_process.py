@@ -45,7 +45,9 @@ from typing import Any
 from pipelines.errors import Cancelled, PipelineError, ResourceError
 from pipelines.manifest import RunHooks, run_stage
 from pipelines.workspace import Workspace
-from worker.locks import folder_lock
+from worker.locks import FolderInUseError, folder_lock
+from worker.outcomes import folder_in_use
+from worker.predecessors import holder_note, run_lock
 from worker.preloading import preload_steps
 
 END_OF_LOG = "\x01end-of-log "
@@ -102,6 +104,8 @@ def error_of(error: BaseException, stage: str) -> dict[str, Any]:
             code="out_of_memory",
             hint="Use a smaller preset, or fewer or smaller images, or a larger machine.",
         ).as_dict()
+    if isinstance(error, FolderInUseError):
+        return folder_in_use(stage)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return ResourceError(
             f"The disk is full: {stage} could not write its results.",
@@ -157,7 +161,10 @@ class Run:
         os.environ["OMP_NUM_THREADS"] = str(self._command["threads"])
         try:
             with folder_lock(
-                self._workspace.root, f"run-{self._stage_name}", PREDECESSOR_TIMEOUT_S
+                self._workspace.root,
+                run_lock(self._stage_name),
+                PREDECESSOR_TIMEOUT_S,
+                holder_note(self._command["token"]),
             ):
                 manifest = self._run()
         except Cancelled:

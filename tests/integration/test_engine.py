@@ -229,6 +229,33 @@ def test_another_worker_takes_over_when_the_lease_has_run_out(
         engine.close()
 
 
+def test_a_frozen_worker_loses_its_stage_to_another_in_the_same_home(
+    tmp_path: Path, redis_server: RedisServer
+) -> None:
+    """Its stage process goes on, in the folder that the other is to use, until that ends it."""
+    engine = Engine(
+        tmp_path,
+        redis_server.url,
+        NERFWORKS_WORKER_LEASE_S="2",
+        NERFWORKS_WORKER_HEARTBEAT_S="0.5",
+        NERFWORKS_WORKER_PREPARE="false",
+    )
+    try:
+        first = engine.start_worker("w1")
+        job_id = engine.submit({"train": {"steps": 50, "step_s": 0.1, "save_every": 5}})
+        engine.wait(lambda: engine.stage(job_id, "train").checkpoint_prefix)
+        first.send_signal(signal.SIGSTOP)
+        engine.start_worker("w2")
+        engine.wait(lambda: len(engine.notes("train start")) == 2)
+        first.send_signal(signal.SIGCONT)
+        job = engine.wait_for(job_id, "succeeded", "failed")
+        assert job.state == "succeeded", job.error
+        assert engine.outcomes(job_id, "train") == ["lost", "succeeded"]
+        assert len(engine.notes("train end")) == 1
+    finally:
+        engine.close()
+
+
 def test_sigterm_gives_the_stage_back_without_counting_and_ends_in_seconds(engine: Engine) -> None:
     worker = engine.start_worker("w1")
     job_id = engine.submit(SLOW)

@@ -13,7 +13,7 @@ import pytest
 from storage.bell import Bell
 from storage.claims import claim_stage
 from storage.jobs import request_cancel, stage_id
-from storage.leases import cancel_stage
+from storage.leases import cancel_stage, heartbeat
 from storage.models import PendingDeletion, StageRow
 from storage.objects_local import LocalObjectStore
 from storage.open_objects import open_object_store
@@ -21,7 +21,7 @@ from storage.queries import WaitingStage
 from storage.settings import StorageSettings
 from tests.factories import make_database, make_job
 from tests.services import Gate
-from worker.housekeeping import Housekeeping, detect_gpu, is_ring_due
+from worker.housekeeping import Grace, Housekeeping, detect_gpu, is_ring_due
 from worker.runtime import WorkerIdentity
 from worker.settings import WorkerSettings
 
@@ -159,3 +159,58 @@ def test_a_hidden_gpu_does_not_count(monkeypatch: pytest.MonkeyPatch, hidden: st
 def test_a_worker_without_a_gpu_leaves_the_gpu_queue_alone() -> None:
     assert WorkerIdentity.of("w", 1, ("cpu", "gpu"), has_gpu=False).queues == ("cpu",)
     assert WorkerIdentity.of("w", 1, ("cpu", "gpu"), has_gpu=True).queues == ("cpu", "gpu")
+
+
+@pytest.mark.parametrize(
+    ("rounds_s", "believed"),
+    [
+        ([0, 2, 4, 6], [True, True, True, True]),
+        ([0, 2, 100, 102, 108, 110, 112], [True, True, False, False, False, True, True]),
+        ([0, 100, 200, 300], [True, False, False, False]),  # it sleeps again and again
+        ([0, 25, 50], [True, True, True]),  # slow, but no lease could have run out
+    ],
+)
+def test_a_reaper_that_was_away_gives_all_their_turn_before_it_reaps(
+    rounds_s: list[int], believed: list[bool]
+) -> None:
+    grace = Grace(WorkerSettings(lease_s=60, heartbeat_s=5, tick_s=2))
+    assert [grace.is_over(T0 + timedelta(seconds=at)) for at in rounds_s] == believed
+
+
+def test_a_machine_that_slept_loses_no_lease_but_one_whose_worker_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = make_database(tmp_path)
+    with database.session_scope() as session:
+        lives, gone = (
+            claim_stage(session, stage_id(make_job(session).id, "first"), "w", 60.0, when=T0)
+            for _ in range(2)
+        )
+    assert lives is not None
+    assert gone is not None
+    keeper = Housekeeping(
+        database,
+        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
+        Bell(NO_BROKER, database),
+        WorkerSettings(),
+        work_dir=tmp_path / "work",
+        register=lambda: None,
+        offer=lambda: None,
+    )
+
+    def reap(at_s: float) -> list[str | None]:
+        monkeypatch.setattr("worker.housekeeping.now", lambda session: at(at_s))
+        keeper.reap()
+        with database.read_scope() as session:
+            return [session.get_one(StageRow, claim.stage_id).state for claim in (lives, gone)]
+
+    def at(seconds: float) -> datetime:
+        return T0 + timedelta(seconds=seconds)
+
+    assert reap(2) == ["running", "running"]
+    assert reap(3600) == ["running", "running"]
+    with database.session_scope() as session:
+        assert not heartbeat(session, lives, 60.0, when=at(3603)).lost
+    assert reap(3602) == ["running", "running"]
+    assert reap(3611) == ["running", "ready"]
+    database.dispose()
