@@ -228,3 +228,108 @@ def nvm_text(truth: CamerasFile, *, r: float = 0.0, images: str = "") -> str:
         numbers = [*map(repr, place.tolist()), *map(str, color.tolist())]
         lines.append(" ".join(numbers) + " 3 0 5 1.5 -2.5 1 6 30.5 -2.5 2 7 1.5 -2.5")
     return "\n".join([*lines, "", "0", "", "#the last part of NVM file", "0", "0"]) + "\n"
+
+
+def _text(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def metashape_sensor(number: int, lens: Intrinsics, *, kind: str = "adjusted") -> str:
+    """A sensor with a calibration; Agisoft's p1 and p2 are OpenCV's p2 and p1."""
+    fisheye = lens.model == "OPENCV_FISHEYE"
+    terms = {
+        "f": lens.fl_y,
+        "cx": lens.cx - lens.width / 2,
+        "cy": lens.cy - lens.height / 2,
+        "b1": lens.fl_x - lens.fl_y,
+        "k1": lens.k1,
+        "k2": lens.k2,
+        "k3": lens.k3,
+        "k4": lens.k4,
+        **({} if fisheye else {"p1": lens.p2, "p2": lens.p1}),
+    }
+    size = f'<resolution width="{lens.width}" height="{lens.height}"/>'
+    inner = "".join(f"<{key}>{value!r}</{key}>" for key, value in terms.items() if value)
+    name = "fisheye" if fisheye else "frame"
+    return (
+        f'<sensor id="{number}" label="lens {number}" type="{name}">{size}'
+        '<property name="pixel_width" value="0.01"/><property name="focal_length" value="0.6"/>'
+        f'<calibration type="{name}" class="initial">{size}<f>1.0</f></calibration>'
+        f'<calibration type="{name}" class="{kind}">{size}{inner}</calibration>{{rig}}</sensor>'
+    )
+
+
+def metashape_pose(world_from_camera: Floats) -> Floats:
+    """The 4x4 matrix of an OpenCV camera, of our pose."""
+    return np.vstack([world_from_camera * [1.0, -1.0, -1.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def metashape_transform(
+    rotation: Floats, translation: Sequence[float] | Floats, scale: float
+) -> str:
+    return (
+        f'<transform><rotation locked="false">{_text(rotation)}</rotation>'
+        f'<translation locked="false">{_text(translation)}</translation>'
+        f'<scale locked="true">{scale!r}</scale></transform>'
+    )
+
+
+def metashape_xml(
+    truth: CamerasFile,
+    *,
+    world: tuple[Floats, Floats, float] | None = None,
+    in_component: bool = False,
+    reference: str = 'LOCAL_CS["Local Coordinates (m)"]',
+    labels: Sequence[str] | None = None,
+    extra: str = "",
+) -> str:
+    """Metashape's camera export. world: rotation [3, 3], translation [3] and scale that bring the
+    cameras as written to the truth; in_component: whether a component has it, else the chunk.
+    extra: further elements among the cameras. Labels are names without folder and suffix."""
+    rotation, translation, scale = world or (np.eye(3), np.zeros(3), 1.0)
+    rows = []
+    for index, image in enumerate(truth.images):
+        pose = metashape_pose(pose_matrix(image)[:3])
+        pose[:3, :3] = rotation.T @ pose[:3, :3]
+        pose[:3, 3] = rotation.T @ (pose[:3, 3] - translation) / scale
+        label = labels[index] if labels else image.file.rpartition("/")[2].removesuffix(".jpg")
+        component = ' component_id="0"' if in_component else ""
+        rows.append(
+            f'<camera id="{index}" sensor_id="{image.camera}"{component} label="{label}">'
+            f"<transform>{_text(pose)}</transform><orientation>1</orientation></camera>"
+        )
+    sensors = [metashape_sensor(n, lens).format(rig="") for n, lens in enumerate(truth.cameras)]
+    moved = metashape_transform(rotation, translation, scale) if world else ""
+    component = f'<component id="0" label="Component 1">{moved}</component>'
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<document version="1.5.0">'
+        f'<chunk label="Chunk 1" enabled="true"><sensors>{"".join(sensors)}</sensors>'
+        f"{f'<components>{component}</components>' if in_component else ''}"
+        f"<cameras>{''.join(rows)}{extra}</cameras>"
+        f"<reference>{reference}</reference>{'' if in_component else moved}"
+        "</chunk></document>"
+    )
+
+
+def realitycapture_csv(truth: CamerasFile, *, count: bool = False) -> str:
+    """RealityCapture's "Internal/External camera parameters", all sixteen columns."""
+    lines = [f"#cameras {len(truth.images)}"] if count else []
+    lines.append("#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2")
+    for image in truth.images:
+        pose, lens = pose_matrix(image)[:3], truth.cameras[image.camera]
+        # Intrinsic rotations about Z, X and Y, in this order.
+        angles = Rotation.from_matrix(pose[:, :3]).as_euler("ZXY", degrees=True)
+        side = max(lens.width, lens.height)
+        numbers = [
+            *pose[:, 3],
+            -angles[0],
+            angles[1],
+            angles[2],
+            lens.fl_x * 36.0 / side,
+            (lens.cx - lens.width / 2) / side,
+            (lens.cy - lens.height / 2) / side,
+            *(lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2),
+        ]
+        name = image.file.rpartition("/")[2]
+        lines.append(",".join([name, *(repr(float(number)) for number in numbers)]))
+    return "\r\n".join(lines) + "\r\n"

@@ -166,6 +166,25 @@ def read_frames(
     )
 
 
+def told_of_motion(file: str, frames: Sequence[Any]) -> tuple[list[str], dict[str, Any]]:
+    """What is to be told where frames have `time`, as D-NeRF's do, and the scene moves: warnings,
+    and notes for `cameras.json`. Nothing where all are of one time."""
+    values = [frame.get("time") for frame in frames if isinstance(frame, dict)]
+    times = {
+        value
+        for value in values
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    }
+    if len(times) < 2:
+        return [], {}
+    span = f"{min(times):g} to {max(times):g}"
+    told = (
+        f"{file} gives its pictures {len(times)} different times ({span}): the scene moves. Motion "
+        "is not modelled: what moves comes out blurred, or not at all."
+    )
+    return [told], {"times": [min(times), max(times)], "motion": "not modelled"}
+
+
 def _checked(
     file: str, listed: Sequence[tuple[Values, Any]]
 ) -> tuple[list[Frame], list[CaptureError]]:

@@ -5,15 +5,16 @@
 
 Keys: camera_angle_x (radians) at the top, frames with file_path ("./train/r_0", without suffix) and
 transform_matrix (world_from_camera, OpenGL camera). World: Blender's, +Z up, no known unit. All
-splits are taken; what is transparent becomes white.
-Source: the published scenes of NeRF, arXiv:2003.08934.
+splits are taken; what is transparent becomes white. Frames of D-NeRF have a `time` from 0 to 1 too:
+it is kept, and told, since a scene that moves is taken for one that does not.
+Source: the published scenes of NeRF, arXiv:2003.08934, and of D-NeRF, arXiv:2011.13961.
 """
 
 from __future__ import annotations
 
 from pipelines.captures.contents import PosedPictures
 from pipelines.captures.importer import Claim, Importer, Listing
-from pipelines.captures.transforms_json import read_frames, read_transforms
+from pipelines.captures.transforms_json import read_frames, read_transforms, told_of_motion
 from pipelines.captures.unpack import CaptureArchive
 
 _SPLITS = ("train", "val", "test")
@@ -51,6 +52,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
             counts[split] = len(frames)
     found = read_frames(archive, claim.root, "transforms_*.json", listed)
     archive.set_aside(archive.images - found.named, "not listed in any transforms_*.json")
+    told, motion = told_of_motion("transforms_*.json", [frame for _, frame in listed])
     return PosedPictures(
         sources=found.sources,
         failures=found.failures,
@@ -59,9 +61,10 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
             "world": "Blender's, +Z up",
             "transparency": "blended on white",
             "splits": counts,
+            **motion,
         },
         details={"num_listed": len(listed), "num_missing": found.num_missing},
-        warnings=found.warnings,
+        warnings=[*found.warnings, *told],
     )
 
 

@@ -23,7 +23,12 @@ from pipelines.captures.contents import PosedPictures, PosedSource
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.named_files import NamedFiles
 from pipelines.captures.parsing import malformed, number, numbers, z_up_from_y_up
-from pipelines.captures.transforms_json import Values, read_frames, read_transforms
+from pipelines.captures.transforms_json import (
+    Values,
+    read_frames,
+    read_transforms,
+    told_of_motion,
+)
 from pipelines.captures.unpack import CaptureArchive
 
 _FILE = "transforms.json"
@@ -56,18 +61,19 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     sources = listed.sources
     if is_arkit:
         sources = [_turned(source) for source in sources]
+    told, motion = told_of_motion(_FILE, frames)
     return PosedPictures(
         sources=sources,
         failures=listed.failures,
         metric=is_arkit,
         up="known" if is_arkit or top.get(_ORIENTATION) == "none" else "assumed",
-        notes={"world": "ARKit, turned to +Z up"} if is_arkit else _notes(top),
+        notes={"world": "ARKit, turned to +Z up"} if is_arkit else _notes(top) | motion,
         details={
             "num_listed": len(frames),
             "num_missing": listed.num_missing,
             "num_unlisted": len(unlisted),
         },
-        warnings=[*listed.warnings, *unread],
+        warnings=[*listed.warnings, *unread, *told],
     )
 
 

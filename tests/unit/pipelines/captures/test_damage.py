@@ -6,6 +6,7 @@ numbers of a JSON file, the headers of pictures and videos.
 
 from __future__ import annotations
 
+import json
 import random
 import struct
 from collections import Counter
@@ -18,7 +19,16 @@ from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError, PipelineError, ToolError
 from pipelines.options import IngestOptions
 from pipelines.stages.ingest import run
-from tests.sfm_writers import colmap_files, pictures_of, walked
+from tests.sfm_writers import (
+    colmap_files,
+    metashape_xml,
+    nvm_text,
+    odm_files,
+    opensfm_reconstruction,
+    pictures_of,
+    realitycapture_csv,
+    walked,
+)
 from tests.unit.pipelines.captures.archives import (
     context,
     llff_files,
@@ -176,6 +186,31 @@ def test_json_with_every_value_of_another_type(tmp_path: Path, value: str) -> No
             changed = text[:begin] + f'"{key}": {value}, "was_' + text[begin + 1 :]
             data = zipped(tmp_path, files | {name: changed}, 0)
             assert outcome(tmp_path / name.replace("/", "_") / str(n), data)
+
+
+@pytest.mark.parametrize("kind", ["opensfm", "opendronemap", "metashape", "realitycapture", "nvm"])
+def test_damaged_lists_of_photogrammetry_programs(tmp_path: Path, kind: str) -> None:
+    """Pieces put in and taken out, as of JSON above, and bytes changed."""
+    truth = walked(num=8)
+    odm = odm_files(truth)
+    name, data = {
+        "opensfm": ("reconstruction.json", json.dumps([opensfm_reconstruction(truth)]).encode()),
+        "opendronemap": ("odm_report/shots.geojson", odm["odm_report/shots.geojson"]),
+        "metashape": ("cameras.xml", metashape_xml(truth, in_component=True).encode()),
+        "realitycapture": ("a.csv", realitycapture_csv(truth).encode()),
+        "nvm": ("a.nvm", nvm_text(truth).encode()),
+    }[kind]
+    files = pictures_of(truth) | (odm if kind == "opendronemap" else {})
+    rng = random.Random(kind)
+    changes = [*mutations(data, 20, 8)]
+    for _ in range(25):
+        where = rng.randrange(len(data))
+        piece = rng.choice(
+            [b'"', b"<", b"]", b"</chunk>", b"null", b"-", b"1e999", b"nan", b",", b"\n", b" ", b""]
+        )
+        changes.append(data[:where] + piece + data[where + rng.randint(0, 30) :])
+    for n, changed in enumerate(changes):
+        assert outcome(tmp_path / str(n), zipped(tmp_path, files | {name: changed}, 0))
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])

@@ -56,19 +56,34 @@ def test_looking_at_a_file_does_not_use_it(tmp_path: Path) -> None:
         ("opensfm/reconstruction.json", b"{}", "OpenSfM"),
         ("poses_bounds.npy", b"", "LLFF"),
         ("odometry.csv", b"timestamp, frame", "Stray Scanner"),
-        ("turntable.xml", b'<?xml version="1.0" encoding="UTF-8"?>\n<document version="1.5.0">',
-         "Metashape"),
-        ("export.csv", b"#cameras 12\n#name,x,y,alt", "RealityCapture"),
         ("a.nvm", b"NVM_V2", "VisualSFM"),
         ("cameras.sfm", b"{}", "Meshroom"),
     ],
-)  # fmt: skip
+)
 def test_poses_of_other_programs_beside_photos_are_named(
     tmp_path: Path, name: str, content: bytes, program: str
 ) -> None:
     files: Files = {f"photos/{n}.jpg": picture(seed=n) for n in range(8)}
     summary, _ = ingest(tmp_path, files | {name: content})
     assert (summary["kind"], summary["num_images"]) == ("images", 8)
+    assert name in warning_with(summary, f"camera poses of {program} are not read")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "program"),
+    [
+        ("sparse/0/cameras.bin", b"", "COLMAP"),
+        ("opensfm/reconstruction.json", b"[]", "OpenSfM"),
+        ("turntable.xml", b'<?xml version="1.0"?>\n<document version="1.5.0">', "Metashape"),
+        ("export.csv", b"#cameras 12\n#name,x,y,alt", "RealityCapture"),
+        ("a.nvm", b"NVM_V3", "VisualSFM"),
+    ],
+)
+def test_further_poses_beside_those_that_are_read_are_named(
+    tmp_path: Path, name: str, content: bytes, program: str
+) -> None:
+    summary, _ = ingest(tmp_path, nerfstudio_files() | {name: content})
+    assert summary["kind"] == "nerfstudio"
     assert name in warning_with(summary, f"camera poses of {program} are not read")
 
 

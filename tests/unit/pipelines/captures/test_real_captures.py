@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ import PIL.Image
 import pytest
 
 from pipelines.captures.sniff import sniff
+from pipelines.errors import CaptureError
 from pipelines.manifest import run_job_locally
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.workspace import Workspace
-from tests.unit.pipelines.captures.archives import write_zip
+from tests.unit.pipelines.captures.archives import picture, write_zip
 from tests.unit.pipelines.captures.depth_agreement import disagreement
 
 pytestmark = [
@@ -221,3 +223,37 @@ def test_door_handle_skips_the_frame_that_is_missing(tmp_path: Path) -> None:
         assert 0.1 < np.median(z) < 1.0
     # The pictures show the floor at their lower edge: a camera's up is the world's up.
     assert all(image.world_from_camera[2][1] > 0.5 for image in file.images)
+
+
+def test_turntable_without_its_photos_says_which_it_wants(tmp_path: Path) -> None:
+    folder = captures() / "metashape-turntable"
+    with pytest.raises(CaptureError) as caught:
+        prepared(tmp_path, zip_of(tmp_path / "turn.zip", folder, folder.iterdir()))
+    assert caught.value.code == "poses_missing"
+    assert "cameras.xml lists 94 pictures" in caught.value.message
+    assert "001, 002, 003, 004, 005 and 89 more" in caught.value.message
+
+
+def test_turntable_cameras_look_at_what_metashape_calls_the_region(tmp_path: Path) -> None:
+    """With pictures of the photos' shape in their place: the region's middle is in front of all."""
+    folder = captures() / "metashape-turntable"
+    files: dict[str, bytes | str] = {
+        f"{n:03d}.jpg": picture(216, 144, seed=n) for n in range(1, 95)
+    }
+    text = (folder / "cameras.xml").read_text()
+    source = write_zip(tmp_path / "turn.zip", files | {"cameras.xml": text}, 0)
+    workspace, summary = prepared(tmp_path, source)
+    assert (summary["kind"], summary["num_posed"], summary["metric"]) == ("metashape", 94, False)
+    file = CamerasFile.load(workspace.posed_cameras)
+    center = re.search("<center>(.*?)</center>", text)
+    assert center is not None
+    move = np.array(file.notes["applied_transform"])
+    middle = move[:, :3] @ [float(word) for word in center[1].split()] + move[:, 3]
+    inside = 0
+    for image in file.images:
+        lens, pose = file.cameras[image.camera], np.array(image.world_from_camera)
+        x, y, z = pose[:, :3].T @ (middle - pose[:, 3])
+        assert -6.0 < z < -3.0, "OpenGL cameras look along -Z"
+        u, v = lens.cx - lens.fl_x * x / z, lens.cy + lens.fl_y * y / z
+        inside += 0 < u < lens.width and 0 < v < lens.height
+    assert inside > 70

@@ -135,3 +135,33 @@ def test_unusable_scenes_are_refused(tmp_path: Path, top: dict[str, Any], code: 
     known = json.loads(str(files["transforms_train.json"]))
     files["transforms_train.json"] = json.dumps(known | top)
     assert code_of(tmp_path, files) == code
+
+
+def with_times(times: list[Any]) -> Files:
+    files = blender_files(train=len(times))
+    top = json.loads(str(files["transforms_train.json"]))
+    for frame, time in zip(top["frames"], times, strict=True):
+        frame["time"] = time
+    return files | {"transforms_train.json": json.dumps(top)}
+
+
+def test_times_of_a_moving_scene_are_kept_and_told(tmp_path: Path) -> None:
+    """D-NeRF's frames, field for field: nobody may take the result for a model of the motion."""
+    summary, ctx = ingest(tmp_path, with_times([0.0, 0.25, 0.5, 0.75, 1.0]))
+    assert "Motion is not modelled" in warning_with(summary, "5 different times (0 to 1)")
+    assert [image.timestamp_s for image in cameras(ctx).images] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    notes = cameras(ctx).notes
+    assert (notes["times"], notes["motion"]) == ([0.0, 1.0], "not modelled")
+
+
+def test_one_moment_is_no_motion(tmp_path: Path) -> None:
+    summary, ctx = ingest(tmp_path, with_times([0.5] * 5))
+    assert summary["warnings"] == []
+    assert "motion" not in cameras(ctx).notes
+
+
+@pytest.mark.parametrize("time", [None, "later", float("nan"), True, [0.5]])
+def test_a_time_that_is_none_costs_its_frame(tmp_path: Path, time: Any) -> None:
+    summary, _ = ingest(tmp_path, with_times([n / 10 for n in range(10)] + [time]))
+    assert summary["num_posed"] in (10, 11)
+    assert warning_with(summary, "Motion is not modelled")

@@ -477,3 +477,17 @@ def test_nerfcapture_is_known_by_its_key(tmp_path: Path) -> None:
         broken: dict[str, Any] = {"depth_integer_scale": 1, key: "x"}
         code = code_of(tmp_path / key, instant_ngp(**broken))
         assert code == "poses_malformed"
+
+
+def test_times_of_a_moving_scene_are_told_and_clocks_are_not(tmp_path: Path) -> None:
+    frames = frames_of(4)
+    for n, frame in enumerate(frames):
+        frame["time"] = n / 3
+    summary, ctx = ingest(tmp_path / "a", nerfstudio_files(4, frames=frames))
+    assert warning_with(summary, "4 different times (0 to 1)", "Motion is not modelled")
+    assert cameras(ctx).notes["motion"] == "not modelled"
+    frames = [
+        {"timestamp" if key == "time" else key: frame[key] for key in frame} for frame in frames
+    ]
+    summary, _ = ingest(tmp_path / "b", nerfstudio_files(4, frames=frames))
+    assert summary["warnings"] == []
