@@ -86,3 +86,7 @@ def require_key(
         with services.database.session_scope() as session:
             touch_api_key(session, key_id)
     return key_id
+
+
+CallerDep = Annotated[str, Depends(require_key)]
+"""The id of the caller's key."""

@@ -41,6 +41,8 @@ from pipelines.errors import CaptureError, PipelineError, ResourceError
 from pipelines.options import OptionsError
 from storage.errors import (
     ConflictError,
+    IdempotencyReusedError,
+    IdempotencyRunningError,
     InvalidCursorError,
     InvalidUrlError,
     NotFoundError,
@@ -165,6 +167,19 @@ def _of_storage(error: StorageError) -> ApiError:
         )
     if isinstance(error, ConflictError):
         return ConflictedError(str(error))
+    if isinstance(error, IdempotencyRunningError):
+        return ConflictedError(
+            "A request with this Idempotency-Key is at work.",
+            code="idempotency_key_running",
+            hint="Send it again in a second: it is answered once.",
+            headers={"Retry-After": "1"},
+        )
+    if isinstance(error, IdempotencyReusedError):
+        return InvalidRequestError(
+            "This Idempotency-Key was used for another request.",
+            code="idempotency_key_reused",
+            hint="Take a new key for each thing that you want made.",
+        )
     if isinstance(error, InvalidCursorError):
         return InvalidRequestError(
             "The cursor is not one of this service.",

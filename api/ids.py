@@ -6,7 +6,7 @@ Whatever has not the form of an id names nothing: it is a 404 before any databas
 from __future__ import annotations
 
 import re
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, StringConstraints
 
@@ -49,10 +49,24 @@ def _label_filter(text: str) -> str:
     return _storable(text)
 
 
+def _storable_json(value: Any) -> Any:
+    left = [value]
+    while left:
+        one = left.pop()
+        if isinstance(one, str):
+            _storable(one)
+        elif isinstance(one, dict):
+            left += [*one, *one.values()]
+        elif isinstance(one, list):
+            left += one
+    return value
+
+
 JobId = Annotated[str, _SHAPE, AfterValidator(_job_id)]
 CaptureId = Annotated[str, _SHAPE, AfterValidator(_capture_id)]
 LabelFilter = Annotated[str, StringConstraints(max_length=400), AfterValidator(_label_filter)]
 """KEY, or KEY=VALUE."""
 LabelKey = Annotated[str, AfterValidator(_label_key)]
 LabelValue = Annotated[str, StringConstraints(max_length=255), AfterValidator(_storable)]
+JsonObject = Annotated[dict[str, Any], AfterValidator(_storable_json)]
 Labels = Annotated[dict[LabelKey, LabelValue], Field(max_length=MAX_LABELS)]

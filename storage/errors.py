@@ -24,6 +24,14 @@ class ConflictError(StorageError):
     """The record's state does not allow the operation."""
 
 
+class IdempotencyRunningError(StorageError):
+    """A call with the same key is at work."""
+
+
+class IdempotencyReusedError(StorageError):
+    """A key was used for another request before."""
+
+
 class InvalidCursorError(StorageError):
     """A page cursor that this service did not hand out."""
 

@@ -253,3 +253,22 @@ class PendingDeletion(Base):
     id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
     prefix: Mapped[str] = mapped_column(String(255))
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
+class IdempotentCall(Base):
+    """A call that creates something, under its caller's key (`storage.idempotency`).
+
+    id: hash of caller, call and key. fingerprint: of what was asked. token, held_until: who works
+    on it, and until when. status, body, location: the answer, once there is one.
+    """
+
+    __tablename__ = "idempotent_calls"
+
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    fingerprint: Mapped[str] = mapped_column(String(64))
+    token: Mapped[str] = mapped_column(String(16))
+    held_until: Mapped[datetime] = mapped_column(UtcDateTime)
+    status: Mapped[int | None] = mapped_column(Integer)
+    body: Mapped[str] = mapped_column(Text, default="")
+    location: Mapped[str] = mapped_column(String(255), default="")
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)

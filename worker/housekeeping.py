@@ -26,6 +26,7 @@ from pathlib import Path
 from storage.bell import Bell
 from storage.db import Database, now
 from storage.deletions import drain_deletions
+from storage.idempotency import forget_old
 from storage.leases import reap_expired
 from storage.objects import ObjectStore
 from storage.queries import WaitingStage, finished_jobs, ready_unclaimed
@@ -175,4 +176,6 @@ class Housekeeping:
                 over = finished_jobs(session, [folder.name for folder in folders])
             for name in over:
                 shutil.rmtree(self._work_dir / name, ignore_errors=True)
+        with self._database.session_scope() as session:
+            forget_old(session)
         drain_deletions(self._database, self._store)  # last: the store may hang

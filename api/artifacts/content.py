@@ -30,6 +30,7 @@ def content_response(
         "ETag": etag,
         "Accept-Ranges": "bytes",
         "Cache-Control": "private, no-cache",
+        "Content-Type": media_type,  # as it is: starlette would add a charset to text
         "Content-Disposition": content_disposition(filename),
         "Content-Security-Policy": "sandbox; default-src 'none'",
     }
@@ -51,10 +52,9 @@ def content_response(
     start, length = (0, size) if part is None else (part.start, len(part))
     headers["Content-Length"] = str(length)
     if request.method == "HEAD":
-        return Response(status_code=status, headers=headers, media_type=media_type)
+        return Response(status_code=status, headers=headers)
     return StreamingResponse(
         services.store.read(key, start, length),
         status_code=status,
         headers=headers,
-        media_type=media_type,
     )

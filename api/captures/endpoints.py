@@ -11,8 +11,9 @@ from starlette.requests import ClientDisconnect
 from api.captures import service
 from api.captures.receiving import Body, Limits, receive, staging_file
 from api.captures.schemas import CapturePage, CaptureView
-from api.deps import ServicesDep
+from api.deps import CallerDep, ServicesDep
 from api.errors import responses
+from api.idempotency import IdempotencyKey, Once
 from api.ids import CaptureId
 from api.problems import ApiError
 from storage import queries, records
@@ -40,13 +41,16 @@ _UPLOAD_SCHEMA = {
 @router.post(
     "",
     status_code=201,
-    responses=responses(408, 413, 415, 507),
+    responses=responses(408, 409, 413, 415, 507),
     openapi_extra=_UPLOAD_SCHEMA,
     response_model=CaptureView,
 )
 async def create_capture(
-    request: Request, response: Response, services: ServicesDep
-) -> CaptureView | Response:
+    request: Request,
+    services: ServicesDep,
+    caller: CallerDep,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
     """Upload a capture as multipart part `file`. What it is, the bytes decide."""
     settings = services.settings
     limits = Limits(settings.max_upload_bytes, settings.min_free_bytes)
@@ -66,9 +70,9 @@ async def create_capture(
         except ApiError:
             await body.linger()
             raise
-        capture = await asyncio.to_thread(service.keep, services, received)
-    response.headers["Location"] = f"{PATH}/{capture.id}"
-    return CaptureView.of(capture)
+        content = (received.sha256, received.filename)
+        once = Once.of(caller, f"POST {PATH}", idempotency_key, *content)
+        return await asyncio.to_thread(service.keep, services, received, once)
 
 
 @router.get("", responses=responses())

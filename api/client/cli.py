@@ -2,9 +2,13 @@
 
     nerfworks up                      keep the service running from this folder
     nerfworks submit FILE             upload, start a job; --wait and --download go on to the end
+    nerfworks submit --capture ID     the same on a capture that is there
     nerfworks status | watch | logs | download [JOB]     the newest job where none is named
     nerfworks cancel | delete JOB
-    nerfworks list | presets
+    nerfworks list | captures | presets
+
+With --json a command prints one JSON document on the standard output, and all else on the standard
+error output.
 
 Exit status: 0 done, 1 the job failed or the call was refused, 2 wrong usage, 3 no service reached.
 Ctrl-C while watching leaves the job running.
@@ -16,9 +20,11 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
 from rich.console import Console
 
 from api.client.client import (
@@ -32,6 +38,7 @@ from api.client.client import (
 )
 from api.client.display import (
     clean,
+    print_captures,
     print_error,
     print_job,
     print_jobs,
@@ -106,30 +113,54 @@ def _watch(client: Client, job_id: str, folder: Path | None, console: Console) -
     return _finish(client, job, folder, console)
 
 
-def submit(client: Client, args: argparse.Namespace, console: Console) -> int:
-    """Upload a capture and start a job."""
-    options, labels = _options(args.set), _labels(args.label)
+def _print_json(found: BaseModel | list[BaseModel]) -> None:
+    """One JSON document on the standard output, and nothing else there."""
+    parts = found if isinstance(found, list) else [found]
+    shown = [part.model_dump(mode="json") for part in parts]
+    print(json.dumps(shown if isinstance(found, list) else shown[0], indent=1))
+
+
+def _sent(client: Client, args: argparse.Namespace, console: Console) -> str:
+    """The capture to work on: the one that was named, or the file, uploaded. Returns its id."""
+    if args.capture is not None:
+        return client.get_capture(args.capture).id
     path = Path(args.file)
-    if not path.is_file():
-        raise UsageError(f"There is no file {args.file}.")
     with transfer_bar(console, "upload") as report:
         capture = client.upload(path, lambda done, total: report(path.name, done, total))
     console.print(f"Capture {capture.id}: {clean(capture.kind)}", highlight=False)
-    job = client.create_job(capture.id, args.preset, options, labels)
+    return capture.id
+
+
+def submit(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Upload a capture, or take one that is there, and start a job."""
+    options, labels = _options(args.set), _labels(args.label)
+    if (args.file is None) == (args.capture is None):
+        raise UsageError("Name a FILE, or a capture that is there: --capture ID.")
+    if args.file is not None and not Path(args.file).is_file():
+        raise UsageError(f"There is no file {args.file}.")
+    client.validate(args.preset, options, labels)  # before minutes of upload
+    job = client.create_job(_sent(client, args, console), args.preset, options, labels)
     console.print(
         f"Job {job.id}: preset {job.preset} ({clean(job.preset_reason)})", highlight=False
     )
+    ended = OK
     if args.wait or args.download is not None:
         folder = None if args.download is None else Path(args.download)
-        return _watch(client, job.id, folder, console)
-    console.print(f"See it: nerfworks watch {job.id}", highlight=False)
-    return OK
+        ended = _watch(client, job.id, folder, console)
+    else:
+        console.print(f"See it: nerfworks watch {job.id}", highlight=False)
+    if args.json:
+        _print_json(client.get_job(job.id))
+    return ended
 
 
 def status(client: Client, args: argparse.Namespace, console: Console) -> int:
     """Show a job as it stands."""
     job = client.get_job(_job_of(client, args))
-    print_job(job, console)
+    if args.json:
+        _print_json(job)
+    else:
+        print_job(job, console)
     return FAILED if job.state == "failed" else OK
 
 
@@ -183,23 +214,44 @@ def delete(client: Client, args: argparse.Namespace, console: Console) -> int:
 
 def list_jobs(client: Client, args: argparse.Namespace, console: Console) -> int:
     """A table of jobs, newest first."""
-    found = []
-    for job in client.jobs(state=args.state, label=args.label):
-        found.append(job)
-        if len(found) >= args.limit:
-            break
-    print_jobs(found, console)
+    found = [*islice(client.jobs(state=args.state, label=args.label), args.limit)]
+    if args.json:
+        _print_json([*found])
+    else:
+        print_jobs(found, console)
+    return OK
+
+
+def captures(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """A table of captures, newest first; --delete removes one and its bytes."""
+    if args.delete is not None:
+        client.delete_capture(args.delete)
+        console.print("Deleted.")
+        return OK
+    found = [*islice(client.captures(), args.limit)]
+    if args.json:
+        _print_json([*found])
+    else:
+        print_captures(found, console)
     return OK
 
 
 def presets(client: Client, args: argparse.Namespace, console: Console) -> int:
     """The presets of the service."""
-    del args
     found = client.presets()
+    if args.json:
+        _print_json(found)
+        return OK
     for preset in found.items:
         mark = f" (the default: {found.default_reason})" if preset.name == found.default else ""
         console.print(f"{preset.name:<10} {clean(preset.summary + mark)}", highlight=False)
     return OK
+
+
+def _count(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError("a number from 1 on")
+    return int(text)
 
 
 def _parser(with_up: bool) -> argparse.ArgumentParser:
@@ -221,13 +273,16 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     if with_up:
         commands.add_parser("up", help="Keep the service running from this folder", add_help=False)
     one = command("submit", submit)
-    one.add_argument("file", metavar="FILE", help="a video, or a .zip of photos or an app export")
+    one.add_argument(
+        "file", nargs="?", metavar="FILE", help="a video, or a .zip of photos or an app export"
+    )
+    one.add_argument("--capture", metavar="ID", help="a capture that was uploaded before")
     one.add_argument("--preset", help="`nerfworks presets` lists them; else the service chooses")
     one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
     one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
     one.add_argument("--wait", action="store_true", help="show the job until it is over")
     one.add_argument("--download", metavar="DIR", help="wait, then download the results there")
-    command("status", status, "newest")
+    as_json = [one, command("status", status, "newest")]
     command("watch", watch, "newest")
     one = command("logs", logs, "newest")
     one.add_argument("--stage", help="only this stage")
@@ -239,8 +294,14 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     one = command("list", list_jobs)
     one.add_argument("--state", help="only jobs in this state")
     one.add_argument("--label", metavar="KEY[=VALUE]", help="only jobs with this label")
-    one.add_argument("--limit", type=int, default=50, help="at most so many")
-    command("presets", presets)
+    one.add_argument("--limit", type=_count, default=50, help="at most so many")
+    as_json.append(one)
+    one = command("captures", captures)
+    one.add_argument("--limit", type=_count, default=50, help="at most so many")
+    one.add_argument("--delete", metavar="ID", help="delete this one")
+    as_json += [one, command("presets", presets)]
+    for one in as_json:
+        one.add_argument("--json", action="store_true", help="print JSON, for programs")
     return parser
 
 
@@ -262,7 +323,8 @@ def main(arguments: list[str] | None = None, up: Callable[[list[str]], int] | No
     if given[:1] == ["up"] and up is not None:
         return up(given[1:])
     args = _parser(with_up=up is not None).parse_args(given)
-    console, errors = Console(), Console(stderr=True)
+    errors = Console(stderr=True)
+    console = errors if getattr(args, "json", False) else Console()
     try:
         with Client(args.url, retry_s=RETRY_S) as client:
             status_code: int = args.run(client, args, console)

@@ -29,6 +29,7 @@ from api.client.models import (
     Job,
     JobError,
     JobFailed,
+    JobPlan,
     LogPage,
     NerfworksError,
     Preset,
@@ -43,6 +44,7 @@ from api.client.wire import (
     Wire,
     checked,
     find_service,
+    once_header,
     poll_pause,
     problem_of,
     segment,
@@ -59,6 +61,7 @@ __all__ = [
     "Job",
     "JobError",
     "JobFailed",
+    "JobPlan",
     "NerfworksError",
     "Preset",
     "Presets",
@@ -69,6 +72,13 @@ __all__ = [
 
 RETRY_S = 60.0
 UPLOAD_TIMEOUT = httpx.Timeout(60.0, connect=5.0, read=600.0)
+
+
+def _wish(
+    preset: str | None, options: dict[str, Any] | None, labels: dict[str, str] | None
+) -> dict[str, Any]:
+    named = {"preset": preset} if preset else {}
+    return {**named, "options": options or {}, "labels": labels or {}}
 
 
 class Client:
@@ -98,21 +108,30 @@ class Client:
 
     # Captures
 
-    def upload(self, path: str | Path, progress: OnProgress | None = None) -> Capture:
+    def upload(
+        self,
+        path: str | Path,
+        progress: OnProgress | None = None,
+        *,
+        idempotency_key: str | None = None,
+    ) -> Capture:
         """Send a capture. An upload that breaks off is sent again from its start.
 
-        Raises NerfworksError for a file that cannot be read, ApiProblem where it is refused.
+        idempotency_key: a text of the caller's own; two uploads of one file under it, also by two
+        programs, make one capture. Raises NerfworksError for a file that cannot be read,
+        ApiProblem where it is refused.
         """
         path = Path(path)
         try:
             with path.open("rb") as file:
+                once = once_header(idempotency_key)
                 body = MultipartFile(file, path.name, os.fstat(file.fileno()).st_size)
 
                 def send() -> httpx.Response:
                     return self._wire.http.post(
                         "/v1/captures",
                         content=body.chunks(progress),
-                        headers=body.headers,
+                        headers={**body.headers, **once},
                         timeout=UPLOAD_TIMEOUT,
                     )
 
@@ -140,15 +159,34 @@ class Client:
         preset: str | None = None,
         options: dict[str, Any] | None = None,
         labels: dict[str, str] | None = None,
+        *,
+        idempotency_key: str | None = None,
     ) -> Job:
-        """Start a job. Repeated only where the request cannot have arrived."""
-        wanted: dict[str, Any] = {"capture_id": capture_id}
-        wanted |= {"preset": preset} if preset else {}
-        wanted |= {"options": options or {}, "labels": labels or {}}
+        """Start a job: one, however often the call had to be sent.
+
+        idempotency_key: a text of the caller's own, so that also a program that was started again
+        makes one job.
+        """
+        wanted = {"capture_id": capture_id, **_wish(preset, options, labels)}
+        once = once_header(idempotency_key)
         answer = self._wire.send(
-            lambda: self._wire.http.post("/v1/jobs", json=wanted), once_only=True
+            lambda: self._wire.http.post("/v1/jobs", json=wanted, headers=once)
         )
         return Job.model_validate(checked(answer).json())
+
+    def validate(
+        self,
+        preset: str | None = None,
+        options: dict[str, Any] | None = None,
+        labels: dict[str, str] | None = None,
+    ) -> JobPlan:
+        """Check what a job would be asked for, before its capture is sent. Creates nothing.
+
+        Raises ApiProblem, whose `errors` name what is wrong.
+        """
+        wanted = _wish(preset, options, labels)
+        answer = self._wire.send(lambda: self._wire.http.post("/v1/jobs:validate", json=wanted))
+        return JobPlan.model_validate(checked(answer).json())
 
     def get_job(self, job_id: str) -> Job:
         """One job as it stands."""

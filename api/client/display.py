@@ -21,7 +21,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from api.client.client import Artifact, Client, Job, Stage
+from api.client.client import Artifact, Capture, Client, Job, Stage
 
 PLAIN_EVERY_S = 15.0
 _STYLES = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}
@@ -236,6 +236,20 @@ def print_jobs(jobs: Iterable[Job], console: Console) -> None:
             f"{job.created_at.astimezone():%Y-%m-%d %H:%M}",
             ", ".join(running),
             "" if psnr is None else f"{psnr:.1f} dB",
+        )
+    console.print(table)
+
+
+def print_captures(captures: Iterable[Capture], console: Console) -> None:
+    """A table of captures."""
+    table = Table("capture", "kind", "size", "created", "file", box=None)
+    for capture in captures:
+        table.add_row(
+            capture.id,
+            clean(capture.kind),
+            size(capture.bytes),
+            f"{capture.created_at.astimezone():%Y-%m-%d %H:%M}",
+            clean(capture.filename),
         )
     console.print(table)
 

@@ -49,6 +49,16 @@ class Stage(_Model):
     finished_at: datetime | None
 
 
+class JobPlan(_Model):
+    """What a job would be. options: complete, of every stage. without: stages it skips."""
+
+    preset: str
+    preset_reason: str
+    options: dict[str, Any]
+    labels: dict[str, str]
+    without: list[str]
+
+
 class JobError(_Model):
     """Why a job failed, and what to do."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,7 +20,7 @@ POLL_MIN_S, POLL_MAX_S = 0.2, 30.0
 PAUSE_FIRST_S, PAUSE_MOST_S = 0.2, 5.0
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 BUSY = frozenset({502, 503, 504})
-_NEVER_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
+RUNNING = "idempotency_key_running"
 _START = "Start one with `make up`, or set NERFWORKS_URL and NERFWORKS_API_KEY."
 
 
@@ -63,10 +64,9 @@ class Wire:
         """A successful GET. Raises ApiProblem, ConnectionFailed."""
         return checked(self.send(lambda: self.http.get(path, params=params)))
 
-    def send(
-        self, request: Callable[[], httpx.Response], *, once_only: bool = False
-    ) -> httpx.Response:
-        """Send until there is an answer. once_only: not again where it may have arrived.
+    def send(self, request: Callable[[], httpx.Response]) -> httpx.Response:
+        """Send until there is an answer. What creates something carries an Idempotency-Key, so that
+        sending it again never makes a second one.
 
         Raises ConnectionFailed after `retry_s` seconds without one.
         """
@@ -75,13 +75,23 @@ class Wire:
             error: httpx.TransportError | None = None
             try:
                 answer = request()
-                if answer.status_code not in BUSY or patience.is_over:
+                if not is_busy(answer) or patience.is_over:
                     return answer
             except httpx.TransportError as failure:
-                if once_only and not isinstance(failure, _NEVER_SENT):
-                    raise unreachable(self.url, failure) from failure
                 error = failure
             patience.pause_or_raise(self.url, error)
+
+
+def is_busy(answer: httpx.Response) -> bool:
+    """Whether the same request may have a better answer in a moment."""
+    if answer.status_code == 409:
+        return problem_of(answer).code == RUNNING
+    return answer.status_code in BUSY
+
+
+def once_header(key: str | None) -> dict[str, str]:
+    """The header that names one call, however often it is sent. key: None for a new one."""
+    return {"Idempotency-Key": key or secrets.token_hex(16)}
 
 
 class Patience:

@@ -6,16 +6,19 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from api.deps import ServicesDep
+from api.deps import CallerDep, ServicesDep
 from api.errors import responses
+from api.idempotency import IdempotencyKey, Once
 from api.ids import JobId, LabelFilter
 from api.jobs import service
 from api.jobs.schemas import (
     JobPage,
+    JobPlan,
     JobRequest,
     JobState,
     JobSummary,
     JobView,
+    JobWish,
     LogView,
     StageName,
 )
@@ -32,20 +35,25 @@ def _hint_poll(response: Response, job: JobView) -> None:
         response.headers["Retry-After"] = POLL_S
 
 
-@router.post("", status_code=202, responses=responses(404))
+@router.post("", status_code=202, responses=responses(404, 409), response_model=JobView)
 def create_job(
     wanted: JobRequest,
     services: ServicesDep,
+    caller: CallerDep,
     request: Request,
-    response: Response,
-) -> JobView:
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
     """Make a capture into assets. The answer's `Location` is the job's address."""
-    job_id = service.create(services, wanted)
-    with services.database.read_scope() as session:
-        job = service.view(services, session, job_id, request)
-    response.headers["Location"] = f"/v1/jobs/{job_id}"
-    _hint_poll(response, job)
-    return job
+    once = Once.of(caller, "POST /v1/jobs", idempotency_key, wanted.model_dump_json())
+    answer = service.create(services, wanted, once, request)
+    answer.headers["Retry-After"] = POLL_S
+    return answer
+
+
+@router.post(":validate", responses=responses())
+def validate_job(wanted: JobWish, services: ServicesDep) -> JobPlan:
+    """Check preset, options and labels before a capture is uploaded. Creates nothing."""
+    return service.plan(services, wanted)
 
 
 @router.get("", responses=responses())

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from api.artifacts.schemas import ArtifactView
-from api.ids import CaptureId, Labels
+from api.ids import CaptureId, JsonObject, Labels
 from pipelines.registry import STAGE_NAMES
 from storage.models import Job, StageRow
 
@@ -21,7 +21,32 @@ StageState = Literal["blocked", "ready", "running", "succeeded", "failed", "canc
 StageName = StrEnum("StageName", {name: name for name in STAGE_NAMES})  # type: ignore[misc]
 
 
-class JobRequest(BaseModel):
+class JobWish(BaseModel):
+    """What to make of a capture, whichever."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "preset": "preview",
+                    "options": {"train": {"max_steps": 500}},
+                    "labels": {"project": "garden"},
+                }
+            ]
+        },
+    )
+
+    preset: str | None = Field(
+        None, max_length=64, description="A name from /v1/presets; left out: the service chooses."
+    )
+    options: JsonObject = Field(
+        default_factory=dict, description="{stage: {option: value}}, laid over the preset."
+    )
+    labels: Labels = Field(default_factory=dict, description="Free text to find the job by.")
+
+
+class JobRequest(JobWish):
     """What to make of a capture."""
 
     model_config = ConfigDict(
@@ -39,13 +64,18 @@ class JobRequest(BaseModel):
     )
 
     capture_id: CaptureId
-    preset: str | None = Field(
-        None, max_length=64, description="A name from /v1/presets; left out: the service chooses."
+
+
+class JobPlan(BaseModel):
+    """What a job would be, as far as that can be said without its capture."""
+
+    preset: str
+    preset_reason: str = Field(description="Why this preset: asked for, or chosen because of ...")
+    options: dict[str, Any] = Field(description="The complete options of every stage.")
+    labels: dict[str, str]
+    without: list[str] = Field(
+        description="Stages that the preset skips; a capture may have no use for others."
     )
-    options: dict[str, Any] = Field(
-        default_factory=dict, description="{stage: {option: value}}, laid over the preset."
-    )
-    labels: Labels = Field(default_factory=dict, description="Free text to find the job by.")
 
 
 class JobErrorView(BaseModel):

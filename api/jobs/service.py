@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from fastapi import Request
 from sqlalchemy.orm import Session
+from starlette.responses import Response
 
 from api.artifacts import service as artifacts
 from api.deps import DELETE_WAIT_S, Services
-from api.jobs.schemas import JobRequest, JobView
+from api.idempotency import Once, do_once
+from api.jobs.schemas import JobPlan, JobRequest, JobView, JobWish
 from api.problems import ConflictedError, FieldProblem, InvalidRequestError
 from pipelines.options import PRESETS, resolve_options, stages_skipped
-from pipelines.registry import STAGES
+from pipelines.registry import STAGE_NAMES, STAGES
 from storage import jobs, queries, records
 from storage.jobs import StageSeed
 from storage.models import Job
@@ -50,30 +52,49 @@ def stage_seeds(preset: str, kind: str) -> list[StageSeed]:
     ]
 
 
-def create(services: Services, wanted: JobRequest) -> str:
-    """Record a job, and have workers told of it. Returns the job's id.
+def plan(services: Services, wanted: JobWish) -> JobPlan:
+    """Check what a job is asked for, before there is a capture.
+
+    Raises InvalidRequestError (preset), OptionsError.
+    """
+    with services.database.read_scope() as session:
+        preset, reason = choose_preset(session, wanted.preset)
+    return JobPlan(
+        preset=preset,
+        preset_reason=reason,
+        options=resolve_options(preset, wanted.options),
+        labels=wanted.labels,
+        without=[name for name in STAGE_NAMES if name in PRESETS[preset].without],
+    )
+
+
+def create(services: Services, wanted: JobRequest, once: Once, request: Request) -> Response:
+    """Record a job, once, and have workers told of it. Returns the answer.
 
     Everything is checked before anything is written. Raises NotFoundError (capture),
     InvalidRequestError (preset), OptionsError.
     """
-    with services.database.read_scope() as session:
+    ready: list[str] = []
+
+    def make(session: Session) -> tuple[JobView, str]:
         kind = records.get_capture(session, wanted.capture_id).kind
         preset, reason = choose_preset(session, wanted.preset)
-    options = resolve_options(preset, wanted.options)
-    with services.database.session_scope() as session:
         job = jobs.create_job(
             session,
             capture_id=wanted.capture_id,
             preset=preset,
             preset_reason=reason,
-            options=options,
+            options=resolve_options(preset, wanted.options),
             stages=stage_seeds(preset, kind),
             labels=wanted.labels,
         )
-        ready = jobs.ready_stage_ids(job)
-        job_id = job.id
-    services.bell.ring(ready)
-    return job_id
+        ready.extend(jobs.ready_stage_ids(job))
+        return view(services, session, job.id, request), f"/v1/jobs/{job.id}"
+
+    done = do_once(services, once, 202, make)
+    if not done.is_replayed:
+        services.bell.ring(ready)
+    return done.response
 
 
 def view(services: Services, session: Session, job_id: str, request: Request) -> JobView:

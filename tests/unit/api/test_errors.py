@@ -27,6 +27,7 @@ V1_CALLS = [
     ("GET", "/v1/captures/x"),
     ("DELETE", "/v1/captures/x"),
     ("POST", "/v1/jobs"),
+    ("POST", "/v1/jobs:validate"),
     ("GET", "/v1/jobs"),
     ("GET", "/v1/jobs/x"),
     ("POST", "/v1/jobs/x/cancel"),
@@ -258,7 +259,15 @@ def test_openapi_names_operations_and_the_shape_of_errors(service: Service) -> N
     ids = {call["operationId"] for calls in document["paths"].values() for call in calls.values()}
     assert ids == {
         *("create_capture", "list_captures", "get_capture", "delete_capture"),
-        *("create_job", "list_jobs", "get_job", "cancel_job", "delete_job", "get_job_logs"),
+        *(
+            "create_job",
+            "validate_job",
+            "list_jobs",
+            "get_job",
+            "cancel_job",
+            "delete_job",
+            "get_job_logs",
+        ),
         *("list_artifacts", "download_artifact", "download_object"),
         *("list_presets", "get_options_schema", "get_liveness", "get_readiness"),
     }

@@ -306,3 +306,26 @@ def test_logs_are_read_from_a_line_on_or_from_the_tail(service: Service) -> None
     assert read(stage="ingest", line=9)["lines"] == ["line 9"]
     assert read(stage="train")["total"] == 0
     problem(service.http.get(path, params={"stage": "paint"}), 422, "request_invalid")
+
+
+def test_a_wish_is_checked_without_a_capture_and_creates_nothing(service: Service) -> None:
+    wish: dict[str, Any] = {
+        "preset": "preview",
+        "options": {"train": {"max_steps": 7}},
+        "labels": {"a": "b"},
+    }
+    answer = service.http.post("/v1/jobs:validate", json=wish)
+    assert answer.status_code == 200
+    plan = answer.json()
+    made = service.job(**wish)
+    assert {name: made[name] for name in ("preset", "preset_reason", "options", "labels")} == {
+        name: plan[name] for name in ("preset", "preset_reason", "options", "labels")
+    }
+    for wrong, code in (
+        ({"preset": "nope"}, "preset_unknown"),
+        ({"options": {"train": {"max_steps": -1}}}, "options_invalid"),
+        ({"labels": {"": "x"}}, "request_invalid"),
+        ({"capture_id": made["capture_id"]}, "request_invalid"),
+    ):
+        problem(service.http.post("/v1/jobs:validate", json=wrong), 422, code)
+    assert len(service.http.get("/v1/jobs").json()["items"]) == 1

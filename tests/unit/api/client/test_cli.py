@@ -363,3 +363,49 @@ def test_text_of_a_service_cannot_steer_the_terminal() -> None:
     screen = io.StringIO()
     Console(file=screen, width=80).print(clean("a\x1b[31mb [bold]c\r\nd"), highlight=False)
     assert screen.getvalue() == "a [31mb [bold]c  d\n"
+
+
+def test_options_are_refused_before_anything_is_uploaded(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for wrong in (["--set", "train.max_stepz=5"], ["--preset", "nope"], ["--label", "b d=1"]):
+        assert cli.main(["submit", str(archive), *wrong]) == 1
+        printed = capsys.readouterr()
+        assert "Capture" not in printed.out, "the file was sent first"
+        assert printed.err
+    with Client() as client:
+        assert list(client.captures()) == []
+
+
+def test_a_capture_that_is_there_is_used_again_and_can_be_deleted(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Client() as client:
+        capture = client.upload(archive)
+        assert cli.main(["submit", "--capture", capture.id, "--preset", "draft"]) == 0
+        (job,) = client.jobs()
+        assert (job.capture_id, job.preset) == (capture.id, "draft")
+        assert cli.main(["captures"]) == 0
+        assert capture.id in capsys.readouterr().out
+        assert cli.main(["submit"]) == cli.main(["submit", str(archive), "--capture", "x"]) == 2
+        assert cli.main(["submit", "--capture", "nope"]) == 1
+        assert cli.main(["captures", "--delete", capture.id]) == 1  # a job is on it
+        client.cancel(job.id)
+        assert cli.main(["captures", "--delete", capture.id]) == 0
+        assert list(client.captures()) == []
+
+
+def test_json_is_all_there_is_on_the_standard_output(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said(*arguments: str) -> Any:
+        assert cli.main([*arguments, "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    job = said("submit", str(archive), "--label", "a=b")
+    assert (job["state"], job["labels"]) == ("queued", {"a": "b"})
+    assert said("status", job["id"]) == job
+    assert [one["id"] for one in said("list", "--label", "a=b")] == [job["id"]]
+    assert said("list", "--state", "failed") == []
+    assert [one["id"] for one in said("captures")] == [job["capture_id"]]
+    assert {one["name"] for one in said("presets")["items"]} == set(PRESETS)

@@ -205,7 +205,7 @@ def test_download_of_an_unknown_name_says_what_there_is(
     client: Client, finished: str, tmp_path: Path
 ) -> None:
     with pytest.raises(NerfworksError, match=r"mesh\.glb"):
-        client.download(finished, tmp_path / "out", names=["mesh.stl"])
+        client.download(finished, tmp_path / "out", names=["mesh.nothing"])
 
 
 class _Unreliable(BaseHTTPRequestHandler):
