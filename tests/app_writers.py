@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
+import tempfile
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +17,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from pipelines.sample.film import walk
 from pipelines.sample.scene import depth_image, pose_matrix, render
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
-from tests.capture_writers import Floats, arkit_pose, jpeg, landscape_camera, named, png, reduced
+from pipelines.tools.ffmpeg import ffmpeg_executable
+from tests.capture_writers import (
+    Floats,
+    arkit_pose,
+    jpeg,
+    landscape_camera,
+    named,
+    png,
+    quaternion,
+    reduced,
+)
 
 _CLOCK_S = 104_137.25
 """What the phone's clock shows at the first frame, seconds."""
@@ -295,3 +308,45 @@ def write_kiri(path: Path, num: int = 5, width: int = 160) -> CamerasFile:
         for index, image in enumerate(truth.images):
             archive.writestr(names[index], jpeg(shown(truth, image)))
     return named(truth, names)
+
+
+def film_of(pictures: list[NDArray[np.uint8]]) -> bytes:
+    """Pictures as frames of an MP4, nearly lossless, at 30 frames a second."""
+    with tempfile.TemporaryDirectory() as folder:
+        for number, picture in enumerate(pictures):
+            Image.fromarray(picture).save(Path(folder) / f"{number:04d}.png")
+        target = Path(folder) / "rgb.mp4"
+        command = [ffmpeg_executable(), "-v", "error", "-framerate", "30"]
+        command += ["-i", f"{folder}/%04d.png", "-pix_fmt", "yuv420p", "-crf", "8", str(target)]
+        subprocess.run(command, check=True)
+        return target.read_bytes()
+
+
+def write_stray_scanner(path: Path, num: int = 6, width: int = 160) -> CamerasFile:
+    """Stray Scanner's recording; the row of frame 2 is missing, and rows have their own lens."""
+    truth = breathing(walk(num, landscape_camera(width), frame_rate=30.0))
+    columns = "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy"
+    rows = [columns + ", distortion_center_x, distortion_center_y"]
+    labels: dict[int, str] = {}
+    with zipfile.ZipFile(path, "w") as archive:
+        for index, image in enumerate(truth.images):
+            lens, pose = truth.cameras[image.camera], pose_matrix(image)
+            matrix = opencv_matrix(arkit_pose(pose))
+            values = [_CLOCK_S + index / 30.0, *matrix[:3, 3], *quaternion(matrix[:3, :3])]
+            values += [lens.fl_x, lens.fl_y, lens.cx - 0.5, lens.cy - 0.5]
+            first, *others = (repr(float(value)) for value in values)
+            if index != 2:
+                rows.append(", ".join([first, f"{index:06d}", *others, "", ""]))
+                labels[index] = f"71de12f9/rgb.mp4 frame {index}"
+            counts = counts_of(reduced(lens, 2), pose, 5.0)
+            archive.writestr(f"71de12f9/depth/{index:06d}.png", png(counts))
+            rated = np.where(counts > 0, 2, 0).astype(np.uint8)
+            archive.writestr(f"71de12f9/confidence/{index:06d}.png", png(rated))
+        film = film_of([shown(truth, image) for image in truth.images])
+        archive.writestr("71de12f9/rgb.mp4", film)
+        archive.writestr("71de12f9/odometry.csv", "\n".join(rows) + "\n")
+        k = _k(truth.cameras[-1])
+        text = "\n".join(", ".join(str(value) for value in row) for row in k)
+        archive.writestr("71de12f9/camera_matrix.csv", text)
+        archive.writestr("71de12f9/imu.csv", "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z")
+    return named(truth, labels)

@@ -23,6 +23,7 @@ from pipelines.captures.importers import (
     record3d,
     rgbd,
     scanner_app,
+    stray_scanner,
     video_file,
     visualsfm,
 )
@@ -35,6 +36,7 @@ IMPORTERS: tuple[Importer, ...] = (
     record3d.IMPORTER,
     polycam.IMPORTER,
     scanner_app.IMPORTER,
+    stray_scanner.IMPORTER,
     opensfm.IMPORTER,
     metashape.IMPORTER,
     realitycapture.IMPORTER,

@@ -55,6 +55,7 @@ class PosedSource:
 
     name: in the archive. lens: gives the intrinsics for the picture's real width and height.
     world_from_camera: rows [3, 4] of finite numbers; whether they are a pose is checked later.
+    frame: where `name` is a film, the number of its frame, counted from 0.
     mask: a picture in the archive, black where the picture is to be ignored, or None.
     depth: what the phone's sensor measured, in the unit of the poses, or None.
     """
@@ -65,6 +66,12 @@ class PosedSource:
     timestamp_s: float | None = None
     mask: str | None = None
     depth: SensorDepth | None = None
+    frame: int | None = None
+
+    @property
+    def label(self) -> str:
+        """What the picture is called where people read it."""
+        return self.name if self.frame is None else f"{self.name} frame {self.frame}"
 
     @property
     def depth_files(self) -> list[str]:
@@ -105,6 +112,8 @@ class PosedPictures:
     picture's, the ways in which they may; the pictures then say which of them is right
     (`pipelines.captures.pose_order`), and `sources` is that one's. failures: why frames beside
     those cannot be used, one error for each; few are passed over, many fail the capture.
+    num_film_frames: how many frames the film of the sources must have for their numbers to be
+    right, or None.
     up: see `Up`. metric: whether the world's unit is the metre. points: in the same world, or None.
     is_dense: whether neighbours are so alike that a long capture may be thinned. notes: about the
     world, for `cameras.json`. details, warnings: for the record.
@@ -113,6 +122,7 @@ class PosedPictures:
     sources: Sequence[PosedSource]
     metric: bool
     readings: Sequence[Reading] = ()
+    num_film_frames: int | None = None
     failures: Sequence[CaptureError] = ()
     is_dense: bool = False
     up: Up = "known"

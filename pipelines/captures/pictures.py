@@ -91,14 +91,21 @@ class PictureWriter:
         """
         kind = self._archive.image_format(name)
         self._archive.extract(name, self._raw)
-        with self._opened(name, kind) as image:
+        return self._store(self._raw, kind, name, number)
+
+    def store_frame(self, path: Path, label: str, number: int) -> Picture:
+        """Write a JPEG that was decoded from a film, as `store` does. label: what it is called."""
+        return self._store(path, "JPEG", label, number)
+
+    def _store(self, raw: Path, kind: str, name: str, number: int) -> Picture:
+        with self._opened(raw, name, kind) as image:
             exif = read_exif(image)
             turned = self._upright and exif.orientation not in (None, 1)
             suffix = ".png" if kind == "PNG" else ".jpg"
             file = f"images/{number:05d}{suffix}"
             target = self._out / file
-            if not turned and _is_clean(image, self._raw):
-                shutil.copyfile(self._raw, target)
+            if not turned and _is_clean(image, raw):
+                shutil.copyfile(raw, target)
                 return Picture(file, name, image.width, image.height, exif)
             upright = PIL.ImageOps.exif_transpose(image) if turned else image
             plain = _plain_rgb(self._in_srgb(_eight_bit(upright), name))
@@ -123,7 +130,7 @@ class PictureWriter:
         Raises CaptureError image_undecodable, also where the size differs.
         """
         self._archive.extract(name, self._raw)
-        with self._opened(name, self._archive.image_format(name)) as image:
+        with self._opened(self._raw, name, self._archive.image_format(name)) as image:
             if image.size != size:
                 raise CaptureError(
                     f'The mask "{shown(name)}" is {image.width}x{image.height}, its picture '
@@ -147,8 +154,8 @@ class PictureWriter:
             self._without_profile.append(name)
             return image
 
-    def _opened(self, name: str, kind: str) -> PIL.Image.Image:
-        return opened(self._raw, name, kind, self._max_pixels)
+    def _opened(self, raw: Path, name: str, kind: str) -> PIL.Image.Image:
+        return opened(raw, name, kind, self._max_pixels)
 
 
 def opened(path: Path, name: str, kind: str, max_pixels: int) -> PIL.Image.Image:

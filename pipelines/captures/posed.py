@@ -14,6 +14,7 @@ import numpy.typing as npt
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, Rows, SparsePoints
 from pipelines.captures.depth_files import DepthWriter
+from pipelines.captures.films import FilmFrames
 from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.captures.parsing import malformed
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
@@ -55,7 +56,7 @@ def write_posed(
 
     source: what `cameras.json` says the poses came from.
     Frames that cannot be used are left out where they are few; depth that cannot be used costs no
-    frame. Raises CaptureError as `pose_order.proven` and
+    frame. Raises CaptureError as `pose_order.proven`, `FilmFrames.decode` and
     `storing.store_each` do, with the code of the frames' own errors where they are many.
     """
     if capture.readings:
@@ -63,19 +64,21 @@ def write_posed(
     sources = capture.sources
     if capture.is_dense:
         picked = evenly_picked(len(sources), options.max_posed_images)
-        kept = {sources[index].name for index in picked}
-        left = [item for item in sources if item.name not in kept]
+        kept = set(picked)
+        left = [item for index, item in enumerate(sources) if index not in kept]
         archive.set_aside(
             [name for item in left for name in (item.name, *item.depth_files)],
             f"of {len(sources)} pictures {len(picked)} are taken, at even distances",
         )
         sources = [sources[index] for index in picked]
     depths = DepthWriter(archive, ctx.out, max_pixels=options.max_pixels)
+    film = FilmFrames(archive, ctx.out, max_pixels=options.max_pixels)
     try:
+        film.decode(sources, capture.num_film_frames, ctx)
         stored, warnings = store_each(
             archive,
             sources,
-            partial(_store, depths),
+            partial(_store, depths, film),
             options,
             ctx,
             upright=False,
@@ -83,6 +86,7 @@ def write_posed(
             failures=capture.failures,
         )
     finally:
+        film.close()
         depths.close()
     archive.set_aside(
         [name for item in sources for name in item.depth_files], "their pictures are left out"
@@ -119,19 +123,34 @@ def write_posed(
             "metric": capture.metric,
             **capture.details,
         },
-        warnings=[*capture.warnings, *warnings, *move.warnings, *depths.warnings],
+        warnings=[
+            *capture.warnings,
+            *film.warnings,
+            *warnings,
+            *move.warnings,
+            *depths.warnings,
+        ],
         points=None if capture.points is None else _points(capture.points, move),
     )
 
 
-def _store(depths: DepthWriter, writer: PictureWriter, source: PosedSource, number: int) -> _Stored:
+def _store(
+    depths: DepthWriter,
+    film: FilmFrames,
+    writer: PictureWriter,
+    source: PosedSource,
+    number: int,
+) -> _Stored:
     """Write one picture, its mask and its depth.
 
     Raises CaptureError for what makes the frame unusable.
     """
-    what = f'"{shown(source.name)}"'
+    what = f'"{shown(source.label)}"'
     pose = checked_pose(np.array(source.world_from_camera, np.float64), what)
-    picture = writer.store(source.name, number)
+    if source.frame is None:
+        picture = writer.store(source.name, number)
+    else:
+        picture = writer.store_frame(film.file(source), source.label, number)
     size = (picture.width, picture.height)
     lens = checked_lens(source.lens(picture.width, picture.height), what)
     mask = None

@@ -116,10 +116,16 @@ def read_camera(archive: CaptureArchive, root: str, published: _Published | None
     what = f'"{shown(file)}"'
     k = lens_of(read_matrix(archive, file), what)
     why = _other_view(archive, file, k)
-    return RgbdCamera(partial(_lens, k, what), None if why else _MILLIMETRE, why)
+    return RgbdCamera(partial(lens_of_picture, k, what), None if why else _MILLIMETRE, why)
 
 
-def _lens(k: tuple[float, float, float, float], what: str, width: int, height: int) -> Intrinsics:
+def lens_of_picture(
+    k: tuple[float, float, float, float], what: str, width: int, height: int
+) -> Intrinsics:
+    """The lens of a picture of that size, of fx, fy, cx, cy that do not say what size they are for.
+
+    Raises CaptureError poses_malformed where their middle is far from the picture's.
+    """
     fx, fy, cx, cy = k
     low, high = _MIDDLE
     if not (low < cx / width < high and low < cy / height < high):

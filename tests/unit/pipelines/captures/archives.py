@@ -239,3 +239,19 @@ def llff_files(count: int = 5) -> dict[str, bytes | str]:
     """An LLFF capture whose pictures have padded names."""
     files: dict[str, bytes | str] = {"poses_bounds.npy": npy(llff_table(count))}
     return files | {f"images/{n:03d}.jpg": picture(seed=n) for n in range(count)}
+
+
+def stray_files(film: bytes, count: int = 12) -> dict[str, bytes | str]:
+    """A Stray Scanner recording of 320x192: frame n is at ARKit position (n, 0.5, -2)."""
+    files: dict[str, bytes | str] = {"scan/rgb.mp4": film, "scan/imu.csv": "timestamp, a_x"}
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, distortion_center_x"]
+    confidence = np.full((24, 40), 2, np.uint8)
+    confidence[0] = 1
+    for n in range(count):
+        rows.append(f"{100 + n / 30}, {n:06d}, {n}.0, 0.5, -2.0, 1, 0, 0, 0, 300, 301, 158, 94, ")
+        depth = np.full((24, 40), 1000 + 10 * n, np.uint16)
+        files[f"scan/depth/{n:06d}.png"] = depth_png(depth)
+        files[f"scan/confidence/{n:06d}.png"] = depth_png(confidence)
+    files["scan/odometry.csv"] = "\n".join(rows)
+    files["scan/camera_matrix.csv"] = "310.0, 0.0, 158.0\n0.0, 311.0, 94.0\n0.0, 0.0, 1.0"
+    return files

@@ -38,6 +38,7 @@ from tests.unit.pipelines.captures.archives import (
     record3d_files,
     rgbd_files,
     scanner_app_files,
+    stray_files,
     write_zip,
 )
 from tests.unit.pipelines.captures.importers.test_blender import blender_files
@@ -140,6 +141,7 @@ def test_end_record_with_a_wrong_number(tmp_path: Path, field: int, more: int) -
         (polycam_files, "keyframes/corrected_cameras/1500000.json"),
         (lambda: scanner_app_files(4, 1), "All_Data/frame_00002.json"),
         (lambda: rgbd_files(4), "pose/2.txt"),
+        (lambda: stray_files(b"\0\0\0\x18ftypmp42"), "scan/odometry.csv"),
         (lambda: rgbd_files(4), "intrinsic/intrinsic_color.txt"),
         (lambda: rgbd_files(4, "list"), "poses.txt"),
     ],
@@ -156,6 +158,12 @@ def test_damaged_text(tmp_path: Path, make: Callable[[], Files], name: str) -> N
         changed = text[:where] + piece + text[where + rng.randint(0, 12) :]
         data = zipped(tmp_path, files | {name: changed}, 0)
         assert outcome(tmp_path / str(n), data)
+
+
+def test_damaged_films_with_poses(tmp_path: Path) -> None:
+    film = make_clip(tmp_path / "a.mp4", "testsrc2=s=320x192:r=12:d=1").read_bytes()
+    for n, changed in enumerate(mutations(film, 8, 8, 40)):
+        assert outcome(tmp_path / str(n), zipped(tmp_path, stray_files(changed), 0))
 
 
 def test_damaged_arrays(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from tests.unit.pipelines.captures.archives import (
     record3d_files,
     rgbd_files,
     scanner_app_files,
+    stray_files,
     write_zip,
 )
 
@@ -98,6 +99,7 @@ def test_single_photo_is_refused_with_advice_to_send_many(tmp_path: Path) -> Non
         ("polycam", polycam_files(corrected=False)),
         ("record3d", record3d_files()),
         ("3dscannerapp", scanner_app_files(2)),
+        ("stray-scanner", stray_files(b"\0\0\0\x18ftypmp42")),
         ("llff", llff_files()),
         ("rgbd", rgbd_files(layout="beside")),
         ("rgbd", rgbd_files(layout="folder")),

@@ -24,6 +24,7 @@ from tests.app_writers import (
     write_scanner_app,
     write_scannet,
     write_seven_scenes,
+    write_stray_scanner,
 )
 from tests.unit.pipelines.captures.archives import context
 from tests.unit.pipelines.captures.depth_agreement import disagreement
@@ -41,6 +42,7 @@ Write = Callable[..., CamerasFile]
         ("rgbd", write_rgbd_list),
         ("nerfstudio", write_nerfcapture),
         ("nerfstudio", write_kiri),
+        ("stray-scanner", write_stray_scanner),
         ("llff", write_llff),
         ("llff", partial(write_llff, as_text=False)),
     ],
