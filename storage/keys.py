@@ -48,3 +48,14 @@ def token_of(key: str) -> int | None:
     first, _, second = (parts[4] if parts[3] == "checkpoint" else parts[3]).partition("-")
     token = first if parts[3] == "checkpoint" else second
     return int(token) if token.isdecimal() else None
+
+
+def folder_of(key: str) -> str | None:
+    """The prefix that a record would name for this object; None for a key of no such form."""
+    parts = key.split("/")
+    if parts[0] == "captures" and len(parts) > 2:
+        return "/".join(parts[:2]) + "/"
+    if parts[0] != "jobs" or token_of(key) is None:
+        return None
+    length = 5 if parts[3] == "checkpoint" else 4
+    return "/".join(parts[:length]) + "/" if len(parts) > length else None

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Protocol
 
@@ -24,6 +25,14 @@ class ObjectStat:
 
     bytes: int
     etag: str
+
+
+@dataclass(frozen=True)
+class ObjectEntry:
+    """An object in a list, and when it was written (UTC)."""
+
+    key: str
+    modified_at: datetime
 
 
 class ObjectStore(Protocol):
@@ -52,6 +61,12 @@ class ObjectStore(Protocol):
 
     def list(self, prefix: str) -> Iterator[str]:
         """The keys that start with `prefix`, which ends in "/"."""
+
+    def list_entries(self, prefix: str) -> Iterator[ObjectEntry]:
+        """The same with times; the objects of one folder come one after the other."""
+
+    def drop_unfinished(self, before: datetime) -> int:
+        """Drop what transfers that were cut short before then left. Returns how many."""
 
     def signed_url(self, key: str, *, expires_s: int, filename: str, media_type: str) -> str:
         """A URL that lets anyone download this one object for so many seconds."""

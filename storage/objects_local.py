@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
-from storage.objects import CHUNK_BYTES, ObjectStat, OnBytes, check_key, check_prefix
+from storage.objects import CHUNK_BYTES, ObjectEntry, ObjectStat, OnBytes, check_key, check_prefix
 from storage.signed_urls import SignedObject, make_object_token
 
 _TEMPORARY = ".nerfworks-tmp"
@@ -120,9 +123,28 @@ class LocalObjectStore:
 
     def list(self, prefix: str) -> Iterator[str]:
         """The keys that start with `prefix`, which ends in "/"."""
+        return (entry.key for entry in self.list_entries(prefix))
+
+    def list_entries(self, prefix: str) -> Iterator[ObjectEntry]:
+        """The same with times; the objects of one folder come one after the other."""
         for path in sorted((self.root / check_prefix(prefix)).rglob("*")):
-            if path.is_file() and not path.name.endswith(_TEMPORARY):
-                yield path.relative_to(self.root).as_posix()
+            try:
+                found = path.stat()
+            except FileNotFoundError:
+                continue  # deleted meanwhile
+            if stat.S_ISREG(found.st_mode) and not path.name.endswith(_TEMPORARY):
+                key = path.relative_to(self.root).as_posix()
+                yield ObjectEntry(key, datetime.fromtimestamp(found.st_mtime, UTC))
+
+    def drop_unfinished(self, before: datetime) -> int:
+        """Drop what transfers that were cut short before then left. Returns how many."""
+        dropped = 0
+        for path in self.root.rglob(f"*{_TEMPORARY}"):
+            with contextlib.suppress(FileNotFoundError):
+                if path.stat().st_mtime < before.timestamp():
+                    path.unlink()
+                    dropped += 1
+        return dropped
 
     def signed_url(self, key: str, *, expires_s: int, filename: str, media_type: str) -> str:
         """A URL of the API that `verify_object_token` accepts for so many seconds."""

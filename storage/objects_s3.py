@@ -6,6 +6,7 @@ import os
 import secrets
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from storage.download_names import content_disposition
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
-from storage.objects import CHUNK_BYTES, ObjectStat, OnBytes, check_key, check_prefix
+from storage.objects import CHUNK_BYTES, ObjectEntry, ObjectStat, OnBytes, check_key, check_prefix
 from storage.settings import StorageSettings
 
 _TRANSFER = TransferConfig(
@@ -127,13 +128,34 @@ class S3ObjectStore:
 
     def list(self, prefix: str) -> Iterator[str]:
         """The keys that start with `prefix`, which ends in "/"."""
+        return (entry.key for entry in self.list_entries(prefix))
+
+    def list_entries(self, prefix: str) -> Iterator[ObjectEntry]:
+        """The same with times; the objects of one folder come one after the other."""
         with _translated(prefix):
             pages = self._quick.get_paginator("list_objects_v2").paginate(
                 Bucket=self._bucket, Prefix=self._prefix + check_prefix(prefix)
             )
             for page in pages:
                 for item in page.get("Contents", []):
-                    yield item["Key"].removeprefix(self._prefix)
+                    key = item["Key"].removeprefix(self._prefix)
+                    yield ObjectEntry(key, item["LastModified"])
+
+    def drop_unfinished(self, before: datetime) -> int:
+        """Drop what transfers that were cut short before then left. Returns how many."""
+        dropped = 0
+        with _translated("half-done uploads"):
+            pages = self._quick.get_paginator("list_multipart_uploads").paginate(
+                Bucket=self._bucket, Prefix=self._prefix
+            )
+            for page in pages:
+                for item in page.get("Uploads", []):
+                    if item["Initiated"] < before:
+                        self._quick.abort_multipart_upload(
+                            Bucket=self._bucket, Key=item["Key"], UploadId=item["UploadId"]
+                        )
+                        dropped += 1
+        return dropped
 
     def signed_url(self, key: str, *, expires_s: int, filename: str, media_type: str) -> str:
         """A presigned GET of one object."""

@@ -14,7 +14,7 @@ from storage.claims import Claim
 from storage.db import clean_text, now
 from storage.errors import ConflictError, NotFoundError
 from storage.keys import capture_prefix
-from storage.models import Capture, Job, LogLine, PendingDeletion, Worker
+from storage.models import Capture, Job, LogLine, PendingDeletion, StageRow, Worker
 from storage.states import JOB_LIVE
 
 WORKER_LIVE_S = 60.0
@@ -146,7 +146,13 @@ def has_live_gpu(session: Session, when: datetime | None = None) -> bool:
 def append_logs(
     session: Session, claim: Claim, lines: Sequence[str], when: datetime | None = None
 ) -> int:
-    """Add lines that a stage wrote, up to MAX_LOG_LINES a stage. Returns how many were kept."""
+    """Add lines that a stage wrote, up to MAX_LOG_LINES a stage. Returns how many were kept.
+
+    None of a claim that another one has replaced, or whose job was deleted.
+    """
+    latest = session.scalar(select(StageRow.lease_token).where(StageRow.id == claim.stage_id))
+    if latest is None or latest > claim.token:
+        return 0
     mine = (LogLine.job_id == claim.job_id, LogLine.stage == claim.name)
     held = session.scalars(select(func.count()).select_from(LogLine).where(*mine)).one()
     room = max(MAX_LOG_LINES - held, 0)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import os
+import secrets
 import shutil
 import socket
 import subprocess
@@ -30,6 +31,7 @@ from storage.idempotency import forget_old
 from storage.leases import reap_expired
 from storage.objects import ObjectStore
 from storage.queries import WaitingStage, finished_jobs, ready_unclaimed
+from storage.reconciling import sweep_orphans
 from worker.settings import WorkerSettings
 
 _log = logging.getLogger("nerfworks.worker")
@@ -112,6 +114,8 @@ class Housekeeping:
         self._settings = settings
         self._work_dir = work_dir
         self._grace = Grace(settings)
+        # Workers that started together do not sweep together.
+        self._sweep_at = time.monotonic() + settings.sweep_s * secrets.randbelow(100) / 400
         self._stopped = threading.Event()
         self._threads = [
             threading.Thread(
@@ -122,7 +126,7 @@ class Housekeeping:
             ),
             threading.Thread(
                 target=self._loop,
-                args=((self.clean,), settings.clean_s),
+                args=((self.clean, self.sweep), settings.clean_s),
                 daemon=True,
                 name="cleaning",
             ),
@@ -167,6 +171,12 @@ class Housekeeping:
             stage.id for stage in waiting if is_ring_due(stage, moment, self._settings.ring_again_s)
         ]
         self._bell.ring(due)
+
+    def sweep(self) -> None:
+        """Search the object store for what belongs to no record; rarely, for it looks at all."""
+        if time.monotonic() >= self._sweep_at:
+            self._sweep_at = time.monotonic() + self._settings.sweep_s
+            sweep_orphans(self._database, self._store)
 
     def clean(self) -> None:
         """Drop what finished jobs left on this machine, and bytes of deleted records."""

@@ -18,6 +18,11 @@ class WorkerSettings(BaseSettings):
     clean_s: float = Field(
         30.0, gt=0, description="Time between two rounds of cleaning up after finished jobs."
     )
+    sweep_s: float = Field(
+        21_600.0,
+        gt=0,
+        description="Time between two searches of the object store for what belongs to no record.",
+    )
     direct_after_s: float = Field(
         10.0, ge=0, description="A free slot takes a ready stage that waited so long by itself."
     )

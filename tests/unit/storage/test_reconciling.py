@@ -1,0 +1,131 @@
+"""What no record names is swept after a day; everything else stays."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+
+from storage.claims import claim_stage
+from storage.db import Database, now
+from storage.deletions import drain_deletions
+from storage.jobs import delete_job, stage_id
+from storage.keys import attempt_prefix, capture_content, checkpoint_prefix, folder_of
+from storage.leases import succeed_stage
+from storage.models import Capture, PendingDeletion, StageRow, new_id
+from storage.objects import ObjectStore
+from storage.objects_local import LocalObjectStore
+from storage.open_objects import open_object_store
+from storage.reconciling import sweep_orphans
+from storage.records import append_logs, delete_capture, read_logs
+from storage.settings import StorageSettings
+from tests.factories import make_job
+from tests.services import S3Endpoint
+
+
+@pytest.fixture(params=["folder", pytest.param("s3", marks=pytest.mark.services)])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ObjectStore]:
+    """Either kind of store."""
+    if request.param == "folder":
+        yield LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b"")
+        return
+    endpoint: S3Endpoint = request.getfixturevalue("s3_endpoint")
+    yield open_object_store(
+        StorageSettings(
+            home=tmp_path,
+            objects_url=f"s3://{endpoint.bucket}/some/prefix",
+            s3_endpoint_url=endpoint.url,
+            s3_access_key_id=endpoint.access_key_id,
+            s3_secret_access_key=endpoint.secret_access_key,
+        )
+    )
+
+
+def put(store: ObjectStore, tmp_path: Path, *keys: str) -> None:
+    source = tmp_path / "source"
+    source.write_bytes(b"x")
+    for key in keys:
+        store.put_file(key, source)
+
+
+def sweep(database: Database, store: ObjectStore, after: timedelta) -> set[str]:
+    with database.read_scope() as session:
+        when = now(session) + after
+    return set(sweep_orphans(database, store, when=when))
+
+
+def test_what_nobody_names_goes_after_a_day_and_all_else_stays(
+    database: Database, store: ObjectStore, tmp_path: Path
+) -> None:
+    with database.session_scope() as session:
+        job = make_job(session)
+        capture = session.get_one(Capture, job.capture_id)
+        done = claim_stage(session, stage_id(job.id, "first"), "w", 1e6)
+        assert done is not None
+        kept = attempt_prefix(job.id, "first", done.attempt, done.token)
+        succeed_stage(session, done, manifest={"files": []}, output_prefix=kept)
+        runs = claim_stage(session, stage_id(job.id, "second"), "w", 1e6)
+        assert runs is not None
+        row = session.get_one(StageRow, runs.stage_id)
+        row.checkpoint_prefix = checkpoint_prefix(job.id, "second", runs.token, 2)
+        dropped = make_job(session)
+        delete_capture_later = dropped.capture_id
+    named = [
+        capture.object_key,
+        kept + "a/b",
+        checkpoint_prefix(job.id, "second", runs.token, 2) + "state",
+        attempt_prefix(job.id, "second", runs.attempt, runs.token) + "just now",
+        "jobs/not-ours",
+        "jobs/x/y/z",
+        "other/thing",
+    ]
+    nobody = new_id()
+    orphans = [
+        capture_content(nobody),  # the API was killed between put and row
+        capture_content(delete_capture_later),
+        attempt_prefix(job.id, "first", done.attempt, done.token + 7) + "a",
+        attempt_prefix(job.id, "second", 1, runs.token + 1) + "a",
+        checkpoint_prefix(job.id, "first", done.token, 1) + "state",
+        attempt_prefix(nobody, "first", 1, 1) + "manifest.json",
+        attempt_prefix(dropped.id, "first", 1, 1) + "manifest.json",
+    ]
+    put(store, tmp_path, *named, *orphans)
+    with database.session_scope() as session:
+        delete_job(session, dropped.id)
+        delete_capture(session, delete_capture_later)
+        for row_to_go in session.query(PendingDeletion):  # as if these had been lost
+            session.delete(row_to_go)
+    assert sweep(database, store, timedelta(hours=23)) == set()
+    assert sweep(database, store, timedelta(hours=25)) == {folder_of(key) for key in orphans}
+    assert sweep(database, store, timedelta(hours=25)) == set(), "swept twice"
+    while drain_deletions(database, store):
+        pass
+    assert all(store.exists(key) for key in named)
+    assert not any(store.exists(key) for key in orphans)
+
+
+def test_transfers_that_were_cut_short_are_dropped(database: Database, tmp_path: Path) -> None:
+    store = LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b"")
+    put(store, tmp_path, capture_content(new_id()))
+    left = store.root / "captures" / f"content.{secrets.token_hex(6)}.nerfworks-tmp"
+    left.write_bytes(b"half")
+    sweep(database, store, timedelta(hours=23))
+    assert left.exists()
+    sweep(database, store, timedelta(hours=25))
+    assert not left.exists()
+
+
+def test_lines_of_a_claim_that_was_replaced_are_not_kept(either_database: Database) -> None:
+    with either_database.session_scope() as session:
+        job = make_job(session)
+        wanted = stage_id(job.id, "first")
+        before = claim_stage(session, wanted, "a", 60.0)
+        assert before is not None
+        assert append_logs(session, before, ["mine"]) == 1
+        session.get_one(StageRow, wanted).lease_token += 1
+        session.flush()
+        assert append_logs(session, before, ["of a zombie"]) == 0
+        assert read_logs(session, job.id).lines == ["mine"]
