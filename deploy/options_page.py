@@ -9,6 +9,7 @@ from typing import Any
 from pipelines.options import PRESETS, STAGE_OPTIONS, method_names, train_options
 
 TABLE_HEAD = ("| option | default | allowed | meaning |", "|---|---|---|---|")
+_NULL = {"type": "null"}
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "options.md"
 
 
@@ -23,8 +24,9 @@ def rows(prefix: str, schema: dict[str, Any], definitions: dict[str, Any]) -> li
             lines.append(f"| `{path}` | | | {nested.get('description', '').splitlines()[0]} |")
             lines += rows(path, nested, definitions)
             continue
+        field = {**next((one for one in field.get("anyOf", []) if one != _NULL), {}), **field}
         default = json.dumps(field.get("default")) if "default" in field else ""
-        limits = " or ".join(f"`{choice}`" for choice in field.get("enum", []))
+        limits = " or ".join(f"`{choice}`" for choice in _choices(field))
         low = field.get("minimum", field.get("exclusiveMinimum"))
         high = field.get("maximum", field.get("exclusiveMaximum"))
         if low is not None or high is not None:
@@ -32,6 +34,12 @@ def rows(prefix: str, schema: dict[str, Any], definitions: dict[str, Any]) -> li
         description = field.get("description", "").replace("|", "\\|")
         lines.append(f"| `{path}` | {default} | {limits} | {description} |")
     return lines
+
+
+def _choices(field: dict[str, Any]) -> list[Any]:
+    """What an option may be, or each item of a list that it is."""
+    choices: list[Any] = field.get("enum") or field.get("items", {}).get("enum") or []
+    return choices
 
 
 def other_methods(known: list[str]) -> list[str]:

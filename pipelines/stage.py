@@ -26,12 +26,14 @@ class Artifact:
 
     name: what people see and download, unique in a job. path: relative to the stage's folder.
     opens_with: one or two programs, shown beside the download.
+    on_request: whether it is there only where options ask for it.
     """
 
     name: str
     path: str
     media_type: str
     opens_with: str
+    on_request: bool = False
 
 
 @dataclass(frozen=True)

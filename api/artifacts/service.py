@@ -60,10 +60,13 @@ def find(job: Job, name: str) -> Published:
         if found.artifact.name == name:
             return found
     makers = {artifact.name: stage.name for stage in STAGES for artifact in stage.artifacts}
+    on_request = {one.name for stage in STAGES for one in stage.artifacts if one.on_request}
     if name not in makers:
         hint = f"A finished job has {', '.join(sorted(makers))}."
     elif any(row.name == makers[name] and row.state == "skipped" for row in job.stages):
         hint = f"A job with preset {job.preset} on such a capture skips {makers[name]}."
+    elif name in on_request:
+        hint = f"It is made only where the options of {makers[name]} ask for it."
     else:
         hint = f"The job is {job.state}; wait until the stage that makes it has succeeded."
     raise MissingError(f"Job {job.id} has no such artifact.", code="artifact_not_found", hint=hint)

@@ -156,11 +156,16 @@ class TrainedScene:
 
     def depth_view(self, lens: Pinhole, pose: Floats) -> DepthView:
         """An undistorted picture with z-depth."""
+        return self.seen(lens, pose)[0]
+
+    def seen(self, lens: Pinhole, pose: Floats) -> tuple[DepthView, Floats]:
+        """An undistorted picture with z-depth, and its accumulation [H, W] in [0, 1]."""
         seen = self.render(lens.intrinsics(), pose)
+        accumulation = as_array(seen.accumulation)
         z_depth = z_depth_of(
-            lens, as_array(seen.depth), as_array(seen.expected_depth), as_array(seen.accumulation)
+            lens, as_array(seen.depth), as_array(seen.expected_depth), accumulation
         )
-        return DepthView(lens, pose, as_uint8(seen.rgb), z_depth)
+        return DepthView(lens, pose, as_uint8(seen.rgb), z_depth), accumulation
 
     def probe_views(self, check: Callable[[], None] = lambda: None) -> list[DepthView]:
         """Small depth views spread over the training images. check: called between them."""

@@ -10,7 +10,6 @@ from them.
 from __future__ import annotations
 
 import json
-import math
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from PIL import Image
 
 from pipelines.errors import TrainingError
 from pipelines.exports.formats.ply import read_ply
+from pipelines.exports.shades import depth_picture, depth_range
 from pipelines.nerf.data.images import split_indices
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
@@ -39,10 +39,6 @@ from pipelines.stage import StageContext
 
 _LOAD_SHARE, _STEREO_SHARE = 0.05, 0.95
 _PICTURE_VIEWS = 6
-_NEAR_TO_FAR = np.array(
-    [[252, 231, 155], [245, 150, 85], [190, 70, 110], [90, 40, 120], [20, 20, 60]], np.float64
-)
-_UNKNOWN = (60, 60, 60)
 
 
 def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
@@ -167,22 +163,8 @@ def _save_picture(path: Path, views: list[StereoView], maps: list[DepthMap]) -> 
     columns = []
     for index in picked:
         grey = np.clip(views[index].picture, 0.0, 1.0)[..., None] * np.ones(3) * 255.0
-        both = (np.rint(grey).astype(np.uint8), _colored(maps[index].z))
+        z = maps[index].z
+        both = (np.rint(grey).astype(np.uint8), depth_picture(z, depth_range(z)))
         padded = [np.pad(item, ((0, height - len(item)), (0, 4), (0, 0))) for item in both]
         columns.append(np.concatenate(padded))
     Image.fromarray(np.concatenate(columns, axis=1)).save(path, quality=88)
-
-
-def _colored(z: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """[H, W, 3] by the logarithm of the depth, over the map's own range."""
-    known = z > 0
-    colors = np.tile(np.array(_UNKNOWN, np.uint8), (*z.shape, 1))
-    if not known.any():
-        return colors
-    low, high = np.percentile(z[known], (2.0, 98.0))
-    span = max(math.log(high / low), 1e-6)
-    place = np.clip(np.log(z[known] / low) / span, 0.0, 1.0) * (len(_NEAR_TO_FAR) - 1)
-    steps = np.arange(len(_NEAR_TO_FAR))
-    channels = [np.interp(place, steps, _NEAR_TO_FAR[:, channel]) for channel in range(3)]
-    colors[known] = np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
-    return colors

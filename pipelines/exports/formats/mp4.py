@@ -1,6 +1,7 @@
-"""Pictures in, an H.264 MP4 out: plays in browsers, written while the pictures are being made.
+"""Pictures in, an MP4 out: H.264, HEVC or AV1, written while the pictures are being made.
 
-yuv420p with even sides, BT.709 tags, `+faststart` (the index comes first). ffmpeg is fed through a
+yuv420p with even sides, BT.709 tags, `+faststart` (the index comes first). HEVC is tagged `hvc1`,
+as Apple's players want it. ffmpeg is fed through a
 pipe by a thread of its own, so that encoding runs beside rendering.
 """
 
@@ -23,7 +24,17 @@ from pipelines.tools.process import Program
 _WAITING_FRAMES = 8
 _CLOSE_LIMIT_S = 300.0
 _POLL_S = 0.5
-_HINT = "Check that the disk has room and that this ffmpeg was built with libx264."
+_CODECS: dict[str, dict[str, str]] = {
+    "h264": {"vcodec": "libx264", "preset": "medium"},
+    "hevc": {
+        "vcodec": "libx265",
+        "preset": "medium",
+        "tag:v": "hvc1",
+        "x265-params": "log-level=warning",
+    },
+    "av1": {"vcodec": "libsvtav1", "preset": "8"},
+}
+"""ffmpeg's options of each."""
 
 
 class VideoWriter:
@@ -33,24 +44,29 @@ class VideoWriter:
     where ffmpeg fails, with its last lines in `details["log"]`.
     """
 
-    def __init__(self, path: Path, width: int, height: int, fps: float, crf: int) -> None:
+    def __init__(
+        self, path: Path, width: int, height: int, fps: float, crf: int, codec: str = "h264"
+    ) -> None:
         if width % 2 or height % 2:
             raise ValueError(f"yuv420p needs even sides, not {width}x{height}")
         self._path = path
         self._shape = (height, width, 3)
+        options = _CODECS[codec]
+        self._hint = (
+            f"Check that the disk has room and that this ffmpeg was built with {options['vcodec']}."
+        )
         stream = ffmpeg.input(
             "pipe:", format="rawvideo", pix_fmt="rgb24", s=f"{width}x{height}", framerate=fps
         ).output(
             str(path),
-            vcodec="libx264",
             pix_fmt="yuv420p",
             crf=crf,
-            preset="medium",
             vf="scale=out_color_matrix=bt709:out_range=tv",
             colorspace="bt709",
             color_primaries="bt709",
             color_trc="bt709",
             movflags="+faststart",
+            **options,
         )
         command = compile_command(stream, log_level="warning")
         self._program = Program(command, stdin=True)
@@ -130,7 +146,7 @@ class VideoWriter:
 
     def _explained(self, failure: ToolError) -> ToolError:
         """The program's failure, told without the last line of its log, which may hold a path."""
-        hint = _HINT if failure.hint == ToolError.hint else failure.hint
+        hint = self._hint if failure.hint == ToolError.hint else failure.hint
         return ToolError(
             f"ffmpeg failed while encoding {self._path.name}.",
             code=failure.code,

@@ -201,8 +201,20 @@ EXPORT = Export(
         Artifact(
             "mesh.ply", "mesh.ply", "application/octet-stream", "MeshLab, CloudCompare, Blender"
         ),
-        Artifact("mesh.obj.zip", "mesh.obj.zip", "application/zip", "unpacked: any 3D program"),
-        Artifact("mesh.stl", "mesh.stl", "model/stl", "slicers for 3D printing"),
-        Artifact("mesh.usdz", "mesh.usdz", "model/vnd.usdz+zip", "iPhone, iPad, Mac, Blender"),
+        Artifact(
+            "mesh.obj.zip",
+            "mesh.obj.zip",
+            "application/zip",
+            "unpacked: any 3D program",
+            on_request=True,
+        ),
+        Artifact("mesh.stl", "mesh.stl", "model/stl", "slicers for 3D printing", on_request=True),
+        Artifact(
+            "mesh.usdz",
+            "mesh.usdz",
+            "model/vnd.usdz+zip",
+            "iPhone, iPad, Mac, Blender",
+            on_request=True,
+        ),
     ),
 )

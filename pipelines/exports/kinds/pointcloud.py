@@ -188,13 +188,33 @@ EXPORT = Export(
             "application/octet-stream",
             "MeshLab, CloudCompare, Blender",
         ),
-        Artifact("pointcloud.las", "pointcloud.las", "application/vnd.las", "CloudCompare, QGIS"),
         Artifact(
-            "pointcloud.laz", "pointcloud.laz", "application/vnd.laszip", "CloudCompare, QGIS"
+            "pointcloud.las",
+            "pointcloud.las",
+            "application/vnd.las",
+            "CloudCompare, QGIS",
+            on_request=True,
         ),
-        Artifact("pointcloud.xyz", "pointcloud.xyz", "text/plain", "CloudCompare, spreadsheets"),
         Artifact(
-            "pointcloud.colmap.zip", "pointcloud.colmap.zip", "application/zip", "COLMAP, gsplat"
+            "pointcloud.laz",
+            "pointcloud.laz",
+            "application/vnd.laszip",
+            "CloudCompare, QGIS",
+            on_request=True,
+        ),
+        Artifact(
+            "pointcloud.xyz",
+            "pointcloud.xyz",
+            "text/plain; charset=utf-8",
+            "CloudCompare, spreadsheets",
+            on_request=True,
+        ),
+        Artifact(
+            "pointcloud.colmap.zip",
+            "pointcloud.colmap.zip",
+            "application/zip",
+            "COLMAP, gsplat",
+            on_request=True,
         ),
     ),
 )

@@ -1,16 +1,69 @@
-"""What a flight along any path needs beside it: a lens, and its most telling moment."""
+"""A flight along a path, and what it needs beside: a lens, and its most telling moment."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import importlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.exports.paths.catalogue import PATHS
+from pipelines.exports.paths.options import PathOptions
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.capture_order import nearest_pose_distance
+from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.focus import find_focus
+
+Floats = NDArray[np.float64]
+
+_UP = np.array([0.0, 0.0, 1.0])
+_STEEP = 1e-4
+
+
+@dataclass(frozen=True)
+class Flight:
+    """poses: [N, 3, 4] world_from_camera, OpenGL cameras, world units.
+
+    fov_deg: [N], vertical, where the path has its own; else that of the capture is used.
+    """
+
+    poses: Floats
+    fov_deg: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def lens(self, index: int, lens: Pinhole) -> Pinhole:
+        """The lens of one frame, from that of the video."""
+        if self.fov_deg is None:
+            return lens
+        focal = 0.5 * lens.height / float(np.tan(np.radians(self.fov_deg[index]) / 2.0))
+        return replace(lens, fl_x=focal, fl_y=focal, cx=lens.width / 2.0, cy=lens.height / 2.0)
+
+
+def make_path(options: PathOptions, images: Sequence[PosedImage], num_frames: int) -> Flight:
+    """The path that options name, in so many frames; a file's own number counts for more."""
+    module_name, _, function_name = PATHS[options.path].partition(":")
+    path: Callable[..., Flight] = getattr(importlib.import_module(module_name), function_name)
+    return path(images, options, num_frames)
+
+
+def looking_at(places: Floats, target: Floats, up: Floats = _UP) -> Floats:
+    """[N, 3, 4] cameras at places [N, 3] that look at a target [3], level as to `up` [3].
+
+    Where one looks along `up`, +Y takes its place, or +X.
+    """
+    back = places - target
+    back /= np.linalg.norm(back, axis=1, keepdims=True)
+    right = np.cross(up, back)
+    for instead in ([0.0, 1.0, 0.0], [1.0, 0.0, 0.0]):
+        steep = np.linalg.norm(right, axis=1) < _STEEP
+        right[steep] = np.cross(instead, back[steep])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses: Floats = np.stack([right, np.cross(back, right), back, places], axis=-1)
+    return poses
 
 
 def preview_index(path: NDArray[np.float64], images: Sequence[PosedImage]) -> int:
@@ -29,6 +82,13 @@ def preview_index(path: NDArray[np.float64], images: Sequence[PosedImage]) -> in
     to_focus = focus - candidates[:, :, 3]
     centred = -(candidates[:, :, 2] * to_focus).sum(axis=1) / np.linalg.norm(to_focus, axis=1)
     return first + int(np.argmax(np.where(distance <= np.median(distance), centred, -np.inf)))
+
+
+def lens_of_size(lens: Intrinsics, width: int, height: int) -> Pinhole:
+    """The lens without its distortion, its picture filling this size; what is too much is cut."""
+    whole = Pinhole.of(lens, max(lens.width, lens.height))
+    grown = max(width / whole.width, height / whole.height)
+    return Pinhole(width, height, whole.fl_x * grown, whole.fl_y * grown, width / 2.0, height / 2.0)
 
 
 def typical_lens(lenses: Sequence[Intrinsics]) -> Intrinsics:

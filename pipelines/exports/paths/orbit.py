@@ -1,7 +1,7 @@
-"""A level circle around what the cameras look at: once round, from the captured side first.
+"""A level circle around what the cameras look at: from the captured side first.
 
-Height and distance are the medians of the captured cameras', so that the circle passes where most
-of them stood; what none of them saw is shown as badly as it is known.
+Height and distance are the medians of the captured cameras', unless they are given, so that the
+circle passes where most of them stood; what none of them saw is shown as badly as it is known.
 """
 
 from __future__ import annotations
@@ -12,15 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ExportError
+from pipelines.exports.paths.flight import Flight, looking_at
+from pipelines.exports.paths.options import PathOptions
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.focus import find_focus
+
+Floats = NDArray[np.float64]
 
 _STEEPEST = np.sin(np.radians(80.0))
 """Cameras that look down more steeply have no level circle: the sideways axis would spin."""
 
 
-def orbit(images: Sequence[PosedImage], num_frames: int) -> NDArray[np.float64]:
-    """[num_frames, 3, 4] poses that look at the focus; the last is one step before the first.
+def orbit(images: Sequence[PosedImage], options: PathOptions, num_frames: int) -> Flight:
+    """Poses that look at the focus, or so far above it; the last is one step before the first.
 
     Raises ExportError (no_focus) where the cameras look at no common point.
     """
@@ -33,17 +37,25 @@ def orbit(images: Sequence[PosedImage], num_frames: int) -> NDArray[np.float64]:
             hint="Set video.path to smooth.",
         )
     away = poses[:, :, 3] - focus
-    distance = float(np.median(np.linalg.norm(away, axis=1)))
-    height = float(np.median(away[:, 2]))
-    height = float(np.clip(height, -_STEEPEST * distance, _STEEPEST * distance))
-    radius = np.sqrt(distance**2 - height**2)
+    captured = float(np.median(np.linalg.norm(away, axis=1)))
+    share = float(np.clip(np.median(away[:, 2]) / captured, -_STEEPEST, _STEEPEST))
+    if options.orbit.height is not None:
+        share = options.orbit.height
+    distance = options.orbit.distance * captured
+    radius = distance * np.sqrt(1.0 - share**2)
     middle = away[:, :2].mean(axis=0)
     first = np.arctan2(middle[1], middle[0])
-    angles = first + 2.0 * np.pi * np.arange(num_frames) / num_frames
-    offsets = np.stack(
-        [radius * np.cos(angles), radius * np.sin(angles), np.full(num_frames, height)], axis=-1
+    angles = first + 2.0 * np.pi * options.orbit.turns * np.arange(num_frames) / num_frames
+    height = np.full(num_frames, share * distance)
+    offsets = np.stack([radius * np.cos(angles), radius * np.sin(angles), height], axis=-1)
+    path = looking_at(focus + offsets, focus)
+    return Flight(
+        np.concatenate((path[:, :, :3] @ _tilt(options.orbit.tilt_deg), path[:, :, 3:]), 2)
     )
-    back = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-    right = np.stack([-np.sin(angles), np.cos(angles), np.zeros(num_frames)], axis=-1)
-    up = np.cross(back, right)
-    return np.stack([right, up, back, focus + offsets], axis=-1)
+
+
+def _tilt(degrees: float) -> Floats:
+    """[3, 3] a turn of a camera about its own X axis: its gaze goes up."""
+    angle = np.radians(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])

@@ -18,6 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.exports.paths.flight import Flight
+from pipelines.exports.paths.options import PathOptions
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.capture_order import capture_order, turn_length
 from pipelines.scene.focus import find_focus
@@ -31,13 +33,14 @@ _MIN_AGREEMENT = 1e-3
 """A mean direction shorter than this is none: cameras that see the focus on opposite sides."""
 
 
-def smooth_flight(images: Sequence[PosedImage], num_frames: int) -> Floats:
-    """[num_frames, 3, 4] world poses along the captured ones, in the order of the walk."""
+def smooth_flight(images: Sequence[PosedImage], options: PathOptions, num_frames: int) -> Flight:
+    """World poses along the captured ones, in the order of the walk."""
+    del options
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     order = capture_order(
         poses, [image.file for image in images], [image.timestamp_s for image in images]
     )
-    return smooth_path(poses[order], num_frames, find_focus(poses))
+    return Flight(smooth_path(poses[order], num_frames, find_focus(poses)))
 
 
 def smooth_path(poses: Floats, num_frames: int, focus: Floats | None = None) -> Floats:

@@ -13,6 +13,8 @@ from pipelines.exports.catalogue import EXPORTS, KINDS, get_export
 from pipelines.exports.export import Export
 from pipelines.options import STAGE_OPTIONS
 from pipelines.registry import STAGE_NAMES, STAGES, get_stage
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.stages import tiny_job
 
 HEAVY = ("torch", "numpy", "open3d", "pycolmap", "PIL")
 
@@ -71,3 +73,11 @@ def test_preloading_brings_what_exports_import_when_they_run() -> None:
         [sys.executable, "-c", program], check=True, capture_output=True, text=True
     )
     assert loaded.stdout.split() == ["True", "True"]
+
+
+@pytest.mark.parametrize("kind", ["mesh", "pointcloud", "video"])
+def test_a_job_that_asks_for_nothing_has_what_is_not_on_request(job: Workspace, kind: str) -> None:
+    manifest = tiny_job.run(job, kind)
+    made = {entry["path"] for entry in manifest["files"]}
+    expected = {one.path for one in get_export(kind).artifacts if not one.on_request}
+    assert made == expected

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import zipfile
+from typing import Any
+
 import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.errors import Cancelled
+from pipelines.errors import Cancelled, ToolError
+from pipelines.exports.formats import mp4
 from pipelines.manifest import RunHooks
+from pipelines.options import OptionsError, resolve_options
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.tools.ffmpeg import probe
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
@@ -36,3 +42,152 @@ def test_a_cancel_in_the_middle_leaves_nothing(job: Workspace) -> None:
         tiny_job.run_with(job, "video", hooks)
     assert not job.stage("video").exists()
     assert not list(job.root.rglob("*.mp4"))
+
+
+@pytest.mark.parametrize("codec", ["hevc", "av1"])
+def test_other_codecs_are_what_they_say(job: Workspace, codec: str) -> None:
+    wanted = {"codec": codec, "width_px": 96, "height_px": 80, "seconds": 0.5, "fps": 20.0}
+    summary = tiny_job.run(job, "video", **wanted)["summary"]
+    path = job.stage("video") / "video.mp4"
+    info = probe(path)
+    assert (info.codec, info.width, info.height, info.fps) == (codec, 96, 80, 20.0)
+    assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == summary["num_frames"] == 10
+    data = path.read_bytes()
+    assert 0 < data.index(b"moov") < data.index(b"mdat")
+    assert (b"hvc1" in data) == (codec == "hevc")
+
+
+OUTPUTS = ("rgb", "depth", "normals", "accumulation")
+
+
+def test_outputs_are_videos_of_their_own_or_one_side_by_side(job: Workspace) -> None:
+    tiny_job.run(job, "video", outputs=OUTPUTS, num_frames=8, crf=1)
+    names = {path.name for path in job.stage("video").glob("video*")}
+    assert names == {"video.mp4", *(f"video-{name}.mp4" for name in OUTPUTS[1:])}
+    for name in names:
+        info = probe(job.stage("video") / name)
+        assert (info.width, info.height) == (36, 64)
+    apart = [
+        _middle(job, f"video-{name}.mp4" if name != "rgb" else "video.mp4") for name in OUTPUTS
+    ]
+    summary = tiny_job.run(
+        job, "video", outputs=OUTPUTS, layout="side_by_side", num_frames=8, crf=1
+    )["summary"]
+    assert {path.name for path in job.stage("video").glob("video*")} == {"video.mp4"}
+    assert (summary["width"], summary["height"]) == (4 * 36, 64)
+    together = _middle(job, "video.mp4")
+    for index, picture in enumerate(apart):
+        part = together[:, 36 * index : 36 * index + 36]
+        assert np.abs(part[:, 2:-2] - picture[:, 2:-2]).mean() < 6.0, OUTPUTS[index]
+        assert picture.std() > 5.0, OUTPUTS[index]
+    assert np.ptp(apart[3], axis=-1).mean() < 6.0, "accumulation is grey"
+
+
+def _middle(job: Workspace, name: str) -> np.ndarray:
+    """One of the video's frames."""
+    reader = imageio_ffmpeg.read_frames(str(job.stage("video") / name))
+    width, height = next(reader)["size"]
+    frames = [np.frombuffer(data, np.uint8).reshape(height, width, 3) for data in reader]
+    return frames[len(frames) // 2].astype(float)
+
+
+def test_a_sequence_is_a_zip_of_pictures(job: Workspace) -> None:
+    tiny_job.run(job, "video", outputs=("normals", "rgb"), codec="png", num_frames=8)
+    files = {path.name for path in job.stage("video").glob("video*")}
+    assert files == {"video-frames.zip"}
+    with zipfile.ZipFile(job.stage("video") / "video-frames.zip") as archive:
+        names = archive.namelist()
+        assert sorted(names) == [
+            f"{output}/{number:05d}.png" for output in ("normals", "rgb") for number in range(1, 9)
+        ]
+        with archive.open("rgb/00005.png") as held, Image.open(held) as picture:
+            assert picture.size == (36, 64)
+            assert np.asarray(picture).std() > 5.0
+
+
+def test_keyframes_zoom_and_a_file_of_nerfstudios_sets_the_size(job: Workspace) -> None:
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    pose = np.vstack([cameras.images[4].world_from_camera, [0.0, 0.0, 0.0, 1.0]])
+    frames = [{"camera_to_world": pose.ravel().tolist(), "fov": fov} for fov in (60.0, 60.0, 30.0)]
+    file = {"render_width": 81, "render_height": 64, "fps": 10, "seconds": 9, "camera_path": frames}
+    summary = tiny_job.run(
+        job, "video", path="camera_path", camera_path=file, codec="png", layout="side_by_side"
+    )["summary"]
+    assert (summary["width"], summary["height"]) == (80, 64)
+    assert (summary["num_frames"], summary["fps"], summary["duration_s"]) == (3, 10.0, 0.3)
+    with zipfile.ZipFile(job.stage("video") / "video-frames.zip") as archive:
+        wide, again, near = (
+            np.asarray(Image.open(archive.open(f"side_by_side/{number:05d}.png")))
+            for number in (1, 2, 3)
+        )
+    np.testing.assert_array_equal(wide, again)
+    # Half of the angle shows the middle, by the ratio of the tangents.
+    share = np.tan(np.radians(15.0)) / np.tan(np.radians(30.0))
+    box = [(1 - share) * 40, (1 - share) * 32, (1 + share) * 40, (1 + share) * 32]
+    cut = np.asarray(Image.fromarray(wide).resize((80, 64), box=tuple(box)))
+    off = np.abs(cut.astype(float) - near).mean()
+    assert off < 0.5 * np.abs(wide.astype(float) - near).mean()
+
+
+def test_a_failing_encoder_leaves_no_half_written_file(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(mp4._CODECS, "av1", {"vcodec": "no-such-encoder"})
+    with pytest.raises(ToolError) as caught:
+        tiny_job.run(job, "video", outputs=("rgb", "depth"), codec="av1")
+    assert "no-such-encoder" in caught.value.hint
+    assert not job.stage("video").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"width_px": 100_000, "height_px": 100_000}, "less than or equal to 8192"),
+        ({"width_px": 0, "height_px": 0}, "greater than or equal to 16"),
+        ({"width_px": 640}, "belong together"),
+        ({"width_px": 641, "height_px": 480}, "multiple of 2"),
+        ({"long_side_px": 0}, "greater than or equal to 64"),
+        ({"num_frames": 1}, "greater than or equal to 8"),
+        ({"fps": 0}, "greater than or equal to 1"),
+        ({"seconds": 0}, "greater than 0"),
+        ({"seconds": 3000, "fps": 60}, "180000 frames; 2 to 20000"),
+        ({"outputs": []}, "at least 1"),
+        ({"outputs": ["rgb", "semantics"]}, "'rgb', 'depth', 'normals' or 'accumulation'"),
+        ({"outputs": OUTPUTS, "layout": "side_by_side", "long_side_px": 8192}, "wider than 16384"),
+        ({"path": "keyframes"}, "at least 2 keyframes, not 0"),
+        (
+            {"path": "keyframes", "keyframes": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]},
+            "not 1",
+        ),
+        (
+            {"keyframes": [{"position": [0, 0, 0], "look_at": [1, 0, 0], "fov_deg": 0}]},
+            "equal to 1",
+        ),
+        ({"keyframes": [{"position": [0, 0, 0]}]}, "one of look_at and rotation"),
+        ({"keyframes": [{"position": [0, 0, 0], "rotation": [0, 0, 0, 0]}]}, "must not be 0"),
+        ({"keyframes": [{"position": [0, 0, 0], "look_at": [0, 0, 0]}]}, "position itself"),
+        ({"path": "camera_path"}, "needs the option camera_path"),
+        ({"path": "teleport"}, "'smooth', 'orbit'"),
+        ({"orbit": {"height": 1.0}}, "less than or equal to 0.98"),
+        ({"spiral": {"radius": 0.0}}, "greater than 0"),
+        ({"tension": 2}, "less than or equal to 1"),
+    ],
+)
+def test_wrong_requests_are_refused_with_the_range(wrong: dict[str, Any], told: str) -> None:
+    with pytest.raises(OptionsError) as caught:
+        resolve_options("preview", {"video": wrong})
+    assert told in str(caught.value)
+
+
+def test_keyframes_without_all_times_or_angles_are_refused() -> None:
+    place = {"position": [0, 0, 0], "look_at": [1, 0, 0]}
+    there = {"position": [0, 1, 0], "look_at": [1, 0, 0]}
+    for frames, told in (
+        ([place, {**there, "seconds": 2}, there], "or for none"),
+        ([place, {**there, "fov_deg": 50}], "for every keyframe, or for none"),
+        ([place, {**there, "seconds": 2, "speed": 1}], "both seconds and speed"),
+        ([place, {**there, "seconds": 3000}], "72000 frames"),
+    ):
+        with pytest.raises(OptionsError) as caught:
+            resolve_options("preview", {"video": {"path": "keyframes", "keyframes": frames}})
+        assert told in str(caught.value)

@@ -6,8 +6,15 @@ import dataclasses
 
 import numpy as np
 
-from pipelines.exports.paths.catalogue import make_path
-from pipelines.exports.paths.flight import preview_index, typical_lens
+from pipelines.exports.paths.flight import (
+    Flight,
+    lens_of_size,
+    looking_at,
+    make_path,
+    preview_index,
+    typical_lens,
+)
+from pipelines.exports.paths.options import PathOptions
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.workspace import Workspace
@@ -16,7 +23,7 @@ from tests.unit.pipelines.scene.synthetic_views import look_at, ring
 
 def test_the_path_follows_the_walk(trained_job: Workspace) -> None:
     images = TrainedScene.load(trained_job.stage("train") / "model.zip").cameras.images
-    path = make_path("smooth", tuple(reversed(images)), 24)
+    path = make_path(PathOptions(), tuple(reversed(images)), 24).poses
     first = np.asarray(images[0].world_from_camera)[:, 3]
     last = np.asarray(images[-1].world_from_camera)[:, 3]
     extent = np.linalg.norm(last - first)
@@ -44,3 +51,29 @@ def test_the_typical_lens_is_centred_and_of_the_most_common_size() -> None:
     lens = typical_lens([other, wide, longer])
     assert (lens.width, lens.height, lens.cx, lens.cy) == (640, 480, 320.0, 240.0)
     assert lens.fl_x == 510.0
+
+
+def test_a_lens_of_another_size_fills_it_and_stretches_nothing() -> None:
+    lens = Intrinsics(1920, 1080, 1500.0, 1500.0, 960.0, 540.0)
+    square = lens_of_size(lens, 540, 540)
+    assert (square.width, square.height, square.cx, square.cy) == (540, 540, 270.0, 270.0)
+    assert square.fl_x == square.fl_y == 750.0, "as high as the capture's picture, less wide"
+    wide = lens_of_size(lens, 3840, 1080)
+    assert wide.fl_x == wide.fl_y == 3000.0, "as wide, less high"
+
+
+def test_a_flight_with_its_own_field_of_view_zooms() -> None:
+    poses = ring(3, np.zeros(3))
+    lens = lens_of_size(Intrinsics(640, 480, 500.0, 500.0, 300.0, 250.0), 320, 240)
+    assert Flight(poses).lens(1, lens) == lens
+    zoomed = Flight(poses, np.array([90.0, 60.0, 30.0])).lens(0, lens)
+    assert np.isclose(zoomed.fl_y, 120.0)
+    assert (zoomed.fl_x, zoomed.cx, zoomed.cy) == (zoomed.fl_y, 160.0, 120.0)
+
+
+def test_looking_straight_down_is_no_spin() -> None:
+    poses = looking_at(np.array([[0.0, 0.0, 5.0], [0.0, 3.0, 0.0], [4.0, 0.0, 0.0]]), np.zeros(3))
+    turns = poses[:, :, :3]
+    assert np.allclose(turns.transpose(0, 2, 1) @ turns, np.eye(3))
+    assert np.allclose(np.linalg.det(turns), 1.0)
+    assert np.allclose(-turns[:, :, 2], [[0, 0, -1], [0, -1, 0], [-1, 0, 0]])
