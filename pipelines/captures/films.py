@@ -19,6 +19,7 @@ from pipelines.stage import StageContext
 from pipelines.tools.ffmpeg import probe
 
 _JPEG_QUALITY = 95
+_TOLD_FRAMES = 30
 _SLACK_FRAMES = 2
 """How many frames a film may have more or fewer than poses were written; an app that is stopped
 loses the last ones."""
@@ -56,6 +57,8 @@ class FilmFrames:
         self._archive.extract(name, film)
 
         def keep(frame: Frame) -> None:
+            if frame.index % _TOLD_FRAMES == 0:
+                ctx.progress(0.0, f"Decoding the film, frame {frame.index}")
             if frame.index in wanted:
                 frame.save(self._path(frame.index), _JPEG_QUALITY)
 

@@ -13,11 +13,19 @@ from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import Rows
 from pipelines.captures.parsing import malformed
 from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
 
 _SLACK = 1e-3
 """How far the last row of a matrix may be from 0 0 0 1; files are rounded."""
 _MATRIX_BYTES = 1 << 16
 _LIST_BYTES = 64 << 20
+
+
+def broken(message: str) -> CaptureError:
+    """The error for poses or intrinsics of files that no app exports again."""
+    return malformed(
+        message, hint="Check the file, or send the pictures alone to have their poses found."
+    )
 
 
 def starts_with_numbers(head: bytes) -> bool:
@@ -39,7 +47,7 @@ def read_numbers(archive: CaptureArchive, name: str, max_bytes: int) -> list[lis
             continue
         values = [_float(word) for word in words]
         if None in values:
-            raise malformed(f'Row {number} of "{shown(name)}" is not of numbers.')
+            raise broken(f'Row {number} of "{shown(name)}" is not of numbers.')
         rows.append([value for value in values if value is not None])
     return rows
 
@@ -57,12 +65,12 @@ def read_list(archive: CaptureArchive, name: str) -> list[list[float]]:
 def pose_of(values: Sequence[float], what: str) -> Rows:
     """The pose [3, 4] that 12 or 16 finite numbers are, row-major. Raises poses_malformed."""
     if len(values) not in (12, 16):
-        raise malformed(f"{what} has {len(values)} numbers, not the 16 of a 4x4 matrix.")
+        raise broken(f"{what} has {len(values)} numbers, not the 16 of a 4x4 matrix.")
     if not all(math.isfinite(value) for value in values):
-        raise malformed(f"{what} has a number that is not finite.")
+        raise broken(f"{what} has a number that is not finite.")
     last = (*values[12:],) or (0.0, 0.0, 0.0, 1.0)
     if any(abs(a - b) > _SLACK for a, b in zip(last, (0, 0, 0, 1), strict=True)):
-        raise malformed(f"{what} has no last row 0 0 0 1.")
+        raise broken(f"{what} has no last row 0 0 0 1.")
     return tuple(tuple(values[at : at + 4]) for at in (0, 4, 8))
 
 
@@ -73,14 +81,14 @@ def lens_of(values: Sequence[float], what: str) -> tuple[float, float, float, fl
     """
     width = {4: 0, 9: 3, 12: 4, 16: 4}.get(len(values))
     if width is None:
-        raise malformed(f"{what} has {len(values)} numbers, not the 9 of a 3x3 matrix.")
+        raise broken(f"{what} has {len(values)} numbers, not the 9 of a 3x3 matrix.")
     if not all(math.isfinite(value) for value in values):
-        raise malformed(f"{what} has a number that is not finite.")
+        raise broken(f"{what} has a number that is not finite.")
     if not width:
         return values[0], values[1], values[2], values[3]
     below = values[2 * width : 2 * width + 3]
     if any(abs(a - b) > _SLACK for a, b in zip(below, (0, 0, 1), strict=True)):
-        raise malformed(f"{what} has no last row 0 0 1.")
+        raise broken(f"{what} has no last row 0 0 1.")
     return values[0], values[width + 1], values[2], values[width + 2]
 
 

@@ -181,22 +181,22 @@ def _pairs(poses: Sequence[Floats]) -> list[Pair]:
     spots = indices[np.linspace(0, len(indices) - 1, min(_SPOTS, len(indices))).astype(int)]
     pairs = {(i, i + gap) for i in spots.tolist() for gap in _GAPS if i + gap < num}
     for each in poses:
-        apart = _apart(each)
         for i in spots.tolist():
-            badness = np.abs(np.log(np.maximum(apart[i], 1e-9) / _APART))
+            badness = np.abs(np.log(np.maximum(_apart(each, i), 1e-9) / _APART))
             badness[i] = np.inf
             j = int(badness.argmin())
             pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)
 
 
-def _apart(poses: Floats) -> Floats:
-    """How far apart cameras are, [N, N]; see _APART."""
+def _apart(poses: Floats, index: int) -> Floats:
+    """How far cameras are from one of them, [N]; see _APART."""
     centers, axes = poses[:, :, 3], poses[:, :, 2]
     with np.errstate(over="ignore", invalid="ignore"):
-        gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
-        angles = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
-    apart: Floats = np.hypot(angles / 30.0, 4.0 * gaps / max(float(gaps.max()), 1e-12))
+        gaps = np.linalg.norm(centers - centers[index], axis=1)
+        extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+        angles = np.degrees(np.arccos(np.clip(axes @ axes[index], -1.0, 1.0)))
+        apart: Floats = np.hypot(angles / 30.0, 4.0 * gaps / max(extent, 1e-12))
     return np.nan_to_num(apart)
 
 

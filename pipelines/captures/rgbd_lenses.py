@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from functools import partial
 
 from pipelines.captures.archive_rules import shown
-from pipelines.captures.matrix_files import lens_of, read_matrix
-from pipelines.captures.parsing import malformed, missing, number, resized
+from pipelines.captures.matrix_files import broken, lens_of, read_matrix
+from pipelines.captures.parsing import missing, number, resized
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.scene.cameras_file import Intrinsics
 
@@ -129,7 +129,7 @@ def lens_of_picture(
     fx, fy, cx, cy = k
     low, high = _MIDDLE
     if not (low < cx / width < high and low < cy / height < high):
-        raise malformed(
+        raise broken(
             f"{what} is for a picture of about {2 * cx:.0f}x{2 * cy:.0f}, and a picture is "
             f"{width}x{height}."
         )
@@ -144,7 +144,7 @@ def _other_view(archive: CaptureArchive, file: str, k: tuple[float, float, float
         return ""
     depth = lens_of(read_matrix(archive, own), f'"{shown(own)}"')
     if min(*depth, *k) <= 0:
-        raise malformed(f'"{shown(own)}" or "{shown(file)}" is not of a camera.')
+        raise broken(f'"{shown(own)}" or "{shown(file)}" is not of a camera.')
     ratios = [(depth[axis] / depth[axis + 2]) / (k[axis] / k[axis + 2]) for axis in (0, 1)]
     if all(abs(ratio - 1) <= _SAME_VIEW for ratio in ratios):
         return ""
@@ -155,13 +155,13 @@ def _of_json(archive: CaptureArchive, file: str) -> RgbdCamera:
     values = archive.read_json(file)
     values = values.get("camera", values) if isinstance(values, dict) else None
     if not isinstance(values, dict):
-        raise malformed(f'"{shown(file)}" has no camera.')
+        raise broken(f'"{shown(file)}" has no camera.')
     w, h, fx, fy, cx, cy = (
         number(values.get(key), f'{key} of "{shown(file)}"')
         for key in ("w", "h", "fx", "fy", "cx", "cy")
     )
     scale = number(values.get("scale", 1.0 / _MILLIMETRE), f'scale of "{shown(file)}"')
     if scale <= 0:
-        raise malformed(f'scale of "{shown(file)}" is not above 0.')
+        raise broken(f'scale of "{shown(file)}" is not above 0.')
     lens = Intrinsics(round(w), round(h), fx, fy, cx + _PIXEL_CENTRE, cy + _PIXEL_CENTRE)
     return RgbdCamera(partial(resized, lens), 1.0 / scale)

@@ -26,8 +26,9 @@ from functools import partial
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, Rows
 from pipelines.captures.importer import Claim, Importer, Listing
+from pipelines.captures.matrix_files import broken
 from pipelines.captures.orders import orders, readings_of
-from pipelines.captures.parsing import malformed, missing, resized
+from pipelines.captures.parsing import missing, resized
 from pipelines.captures.roles import file_role
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -65,7 +66,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     names = _pictures(archive, claim.root)
     found = orders(names, len(rows), by_number=False)
     if not found:
-        raise malformed(
+        raise broken(
             f"{_FILE} has poses of {len(rows)} pictures, and {len(names)} pictures lie in "
             f'"{shown(_folder(names[0]) or "the top folder")}": it cannot be told which pose is '
             "whose."
@@ -129,14 +130,14 @@ def _rows(data: bytes, file: str) -> list[tuple[float, ...]]:
     try:
         form, fortran, shape, start = _header(data)
     except (ValueError, SyntaxError, KeyError, TypeError, struct.error, RecursionError) as error:
-        raise malformed(f"{what} is no array that is read.") from error
+        raise broken(f"{what} is no array that is read.") from error
     if len(shape) != 2 or shape[1] != _COLUMNS or fortran:
-        raise malformed(f"{what} is an array of {shape}, not of rows of {_COLUMNS} numbers.")
+        raise broken(f"{what} is an array of {shape}, not of rows of {_COLUMNS} numbers.")
     if not shape[0]:
         raise missing(f"{what} has no rows.")
     row = struct.Struct(f"<{_COLUMNS}{form}")
     if len(data) - start != shape[0] * row.size:
-        raise malformed(
+        raise broken(
             f"{what} says that it has {shape[0]} rows, and holds {len(data) - start} bytes of "
             f"{shape[0] * row.size}."
         )
@@ -165,11 +166,11 @@ def _header(data: bytes) -> tuple[str, bool, tuple[int, ...], int]:
 def _row(values: Sequence[float], what: str) -> _Row:
     """A pose [3, 4] and its lens. Raises CaptureError poses_malformed."""
     if not all(math.isfinite(value) for value in values):
-        raise malformed(f"{what} has a number that is not finite.")
+        raise broken(f"{what} has a number that is not finite.")
     table = [values[at : at + 5] for at in (0, 5, 10)]
     height, width, focal = (row[4] for row in table)
     if not all(0 < value < _MOST_PIXELS for value in (height, width, focal)):
-        raise malformed(f"{what} is not of a camera's picture: {width:g}x{height:g}, {focal:g}.")
+        raise broken(f"{what} is not of a camera's picture: {width:g}x{height:g}, {focal:g}.")
     lens = Intrinsics(round(width), round(height), focal, focal, width / 2, height / 2)
     pose = tuple((right, -down, back, place) for down, right, back, place, _ in table)
     return _Row(pose, lens)

@@ -23,9 +23,15 @@ from dataclasses import dataclass, field
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, Reading, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
-from pipelines.captures.matrix_files import pose_of, read_list, read_matrix, starts_with_numbers
+from pipelines.captures.matrix_files import (
+    broken,
+    pose_of,
+    read_list,
+    read_matrix,
+    starts_with_numbers,
+)
 from pipelines.captures.orders import numbered, orders, readings_of
-from pipelines.captures.parsing import each_frame, malformed, missing, opengl_camera, some_of
+from pipelines.captures.parsing import each_frame, missing, opengl_camera, some_of
 from pipelines.captures.rgbd_lenses import (
     REPLICA,
     REPLICA_SEMANTIC,
@@ -80,29 +86,36 @@ def _beside(listing: Listing) -> Iterable[Claim]:
 
 
 def _pose_folders(listing: Listing, with_photos: set[str]) -> Iterable[Claim]:
-    """Folders of a folder of poses and one of pictures."""
-    for name in listing.heads:
-        folder = _above(name)
-        root = _above(folder[:-1])
-        if (
-            name.endswith(".txt")
-            and folder[len(root) : -1] in _POSE_FOLDERS
-            and _photo_folder(with_photos, root)
-            and _is_numeric(listing, name)
-        ):
-            yield Claim(root, _FOLDER)
+    """Folders of a folder of poses and one of pictures, with intrinsics or depth."""
+    roots = {
+        _above(_above(name)[:-1])
+        for name in listing.heads
+        if name.endswith(".txt")
+        and name.rpartition("/")[0].rpartition("/")[2] in _POSE_FOLDERS
+        and _is_numeric(listing, name)
+    }
+    for root in _rgbd_roots(listing, with_photos, roots):
+        yield Claim(root, _FOLDER)
 
 
 def _lists(listing: Listing, with_photos: set[str]) -> Iterable[Claim]:
-    """Folders of a list of poses, a folder of pictures, and intrinsics or depth."""
-    with_depth = {_above(name) for name in listing.pictures if name.endswith(".png")}
+    """Folders of a list of poses and a folder of pictures, with intrinsics or depth."""
     for file in _LISTS:
-        for root in listing.roots_of(file):
-            photos = _photo_folder(with_photos, root)
-            if photos and _is_numeric(listing, root + file):
-                depths = (root + folder + "/" for folder in _DEPTH_FOLDERS)
-                if find_lens_file(listing.heads, root) or any(d in with_depth for d in depths):
-                    yield Claim(root, file)
+        roots = [root for root in listing.roots_of(file) if _is_numeric(listing, root + file)]
+        for root in _rgbd_roots(listing, with_photos, roots):
+            yield Claim(root, file)
+
+
+def _rgbd_roots(listing: Listing, with_photos: set[str], roots: Iterable[str]) -> Iterable[str]:
+    """Those of the folders that have pictures, and intrinsics or depth: numbers beside photos
+    alone are mostly something else."""
+    with_depth = {_above(name) for name in listing.pictures if name.endswith(".png")}
+    for root in roots:
+        depths = (f"{root}{folder}/" for folder in _DEPTH_FOLDERS)
+        if _photo_folder(with_photos, root) and (
+            find_lens_file(listing.heads, root) or any(folder in with_depth for folder in depths)
+        ):
+            yield root
 
 
 def _above(name: str) -> str:
@@ -236,7 +249,7 @@ def _by_list(
         raise missing(f"{what} has no poses.")
     found = orders(pictures, len(rows), by_number=True)
     if not found:
-        raise malformed(
+        raise broken(
             f"{what} has {len(rows)} poses, and there are {len(pictures)} pictures, whose names do "
             "not say by a number which pose is whose."
         )

@@ -15,12 +15,16 @@ from pipelines.captures.unpack import CaptureArchive
 from pipelines.registry import skipped_stages
 from pipelines.scene.cameras_file import Intrinsics
 from tests.unit.pipelines.captures.archives import (
+    llff_files,
     nerfstudio_files,
     picture,
     polycam_files,
     record3d_files,
+    rgbd_files,
+    scanner_app_files,
     write_zip,
 )
+from tests.unit.pipelines.captures.importers.test_blender import blender_files
 from tests.unit.pipelines.captures.ingesting import Files, cameras, ingest, warning_with
 
 
@@ -76,6 +80,29 @@ def test_precedence_is_the_order_of_the_catalogue(
     assert sniff(path, "c").kind == min(("polycam", "nerfstudio", "record3d"), key=order.index)
     monkeypatch.setattr(catalogue, "IMPORTERS", catalogue.IMPORTERS[::-1])
     assert sniff(path, "c").kind == "images"
+
+
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [
+        ("nerfstudio", nerfstudio_files()),
+        ("blender", blender_files(train=4)),
+        ("record3d", {name.removeprefix("EXR_RGBD/"): d for name, d in record3d_files().items()}),
+        ("polycam", polycam_files()),
+        (
+            "3dscannerapp",
+            {name.removeprefix("All_Data/"): d for name, d in scanner_app_files(4).items()},
+        ),
+    ],
+)
+def test_bare_numbers_beside_a_format_that_names_its_pictures_take_nothing_from_it(
+    tmp_path: Path, kind: str, files: Files
+) -> None:
+    """Converters leave LLFF's file and lists of poses beside what they were made from."""
+    others = {**llff_files(4), **rgbd_files(4, "list"), **rgbd_files(4), **rgbd_files(4, "beside")}
+    path = write_zip(tmp_path / "c", others | files)
+    assert sniff(path, "c").kind == kind
+    assert sniff(write_zip(tmp_path / "d", others), "c").kind == "llff"
 
 
 def test_every_kind_has_its_stages_and_a_reader_where_it_needs_one() -> None:

@@ -264,8 +264,9 @@ def test_counts_at_the_end_of_their_range_are_unknown(tmp_path: Path) -> None:
     ["the poses of the dancers\n", "0 0.5 0.5 0.1 0.1\n"],
 )
 def test_photos_beside_other_texts_stay_photos(tmp_path: Path, text: str) -> None:
-    """A list is only one with intrinsics or depth beside; labels are no poses."""
+    """Poses are only poses with intrinsics or depth beside; others note how people stand."""
     files: Files = {f"images/{n}.jpg": picture(seed=n) for n in range(8)}
-    files |= {f"labels/{n}.txt": "0 0.5 0.5 0.1 0.1" for n in range(8)}
+    for folder in ("labels", "poses", "pose"):
+        files |= {f"{folder}/{n}.txt": "0 0.5 0.5 0.1 0.1" for n in range(8)}
     summary, _ = ingest(tmp_path, files | {"poses.txt": text})
     assert summary["kind"] == "images"
