@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import threading
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -60,6 +62,7 @@ def open_services(settings: ApiSettings) -> Services:
             Probe("object_store", store.ping),
         ),
         threading.BoundedSemaphore(MAX_STORE_CALLS),
+        threading.BoundedSemaphore(settings.max_uploads),
     )
 
 
@@ -73,6 +76,9 @@ def close_services(services: Services) -> None:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     services = await run_in_threadpool(open_services, app.state.settings)
+    # An upload writes in one thread at most: a disk or a store that hangs stops its own alone.
+    threads = ThreadPoolExecutor(services.settings.max_uploads, thread_name_prefix="upload")
+    asyncio.get_running_loop().set_default_executor(threads)
     app.state.services = services
     try:
         yield
@@ -118,6 +124,7 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
     errors.install(
         app,
         max_body_bytes=settings.max_body_bytes,
+        max_body_s=settings.small_body_s,
         upload_path=captures.PATH,
         routes=[*app.routes, *(route for one in (*keyed, *others) for route in one.routes)],
     )

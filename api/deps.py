@@ -38,6 +38,20 @@ class Services:
     probes: tuple[Probe, ...]
     store_calls: threading.BoundedSemaphore
     """Held by a request that waits for the object store: a store that hangs stops only so many."""
+    uploads: threading.BoundedSemaphore
+    """Held by an upload from its first byte to its answer."""
+
+    @contextmanager
+    def taking_an_upload(self) -> Iterator[None]:
+        """Around an upload. Raises UnavailableError where as many as may be are coming in."""
+        if not self.uploads.acquire(blocking=False):
+            raise UnavailableError(
+                f"{self.settings.max_uploads} uploads are coming in already.", code="uploads_busy"
+            )
+        try:
+            yield
+        finally:
+            self.uploads.release()
 
     @contextmanager
     def asking_the_store(self) -> Iterator[None]:

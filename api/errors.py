@@ -6,6 +6,7 @@ same shape. Tracebacks go to the log with the request id, never into an answer.
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import json
 import logging
@@ -63,8 +64,14 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _QUIET_PATHS = frozenset({"/livez", "/readyz"})
 _SECRET_PATH = re.compile(r"(/v1/objects/).*", re.DOTALL)
 _CAPTURE_STATUS = {"too_large": 413, "archive_bomb": 413, "unknown_type": 415}
-_FRAMEWORK_CODES = {404: "not_found", 405: "method_not_allowed", 413: "too_large"}
+_FRAMEWORK_CODES = {
+    408: "request_timeout",
+    404: "not_found",
+    405: "method_not_allowed",
+    413: "too_large",
+}
 _FRAMEWORK_HINTS = {
+    408: "Send the request again, faster.",
     404: "Check the address; /docs lists every call.",
     405: "Use one of the methods that the Allow header names.",
     413: "Send less: only an upload to /v1/captures may be large.",
@@ -281,10 +288,11 @@ class RequestGuard:
 
 
 class BodyLimit:
-    """Refuses bodies that are too large for what is no upload, before they are held in memory."""
+    """Refuses bodies that are too large, or too slow, for what is no upload."""
 
-    def __init__(self, app: ASGIApp, max_bytes: int, upload_path: str) -> None:
+    def __init__(self, app: ASGIApp, max_bytes: int, max_s: float, upload_path: str) -> None:
         self.app = app
+        self.max_s = max_s
         self.max_bytes = max_bytes
         self.upload_path = upload_path
 
@@ -293,11 +301,19 @@ class BodyLimit:
         if scope["type"] != "http" or scope["path"] == self.upload_path:
             await self.app(scope, receive, send)
             return
-        taken = 0
+        taken, is_whole = 0, False
+        give_up_at: float | None = None
 
         async def receive_bounded() -> Message:
-            nonlocal taken
-            message = await receive()
+            nonlocal taken, is_whole, give_up_at
+            if give_up_at is None:
+                give_up_at = asyncio.get_running_loop().time() + self.max_s
+            try:  # what comes after the body is the end of the connection, which may be far off
+                async with asyncio.timeout_at(None if is_whole else give_up_at):
+                    message = await receive()
+            except TimeoutError as error:
+                raise HTTPException(408) from error
+            is_whole = not message.get("more_body", False)
             taken += len(message.get("body", b""))
             if taken > self.max_bytes:
                 raise HTTPException(413)
@@ -307,7 +323,12 @@ class BodyLimit:
 
 
 def install(
-    app: FastAPI, *, max_body_bytes: int, upload_path: str, routes: list[BaseRoute]
+    app: FastAPI,
+    *,
+    max_body_bytes: int,
+    max_body_s: float,
+    upload_path: str,
+    routes: list[BaseRoute],
 ) -> None:
     """Register the handlers and the guards. routes: all that the application answers."""
     handler: Callable[[Request, Any], Awaitable[Response]] = _handle
@@ -328,5 +349,7 @@ def install(
         app.add_exception_handler(kind, handler)
     app.state.known_routes = routes
     app.add_middleware(HeadOfGet, routes=routes)
-    app.add_middleware(BodyLimit, max_bytes=max_body_bytes, upload_path=upload_path)
+    app.add_middleware(
+        BodyLimit, max_bytes=max_body_bytes, max_s=max_body_s, upload_path=upload_path
+    )
     app.add_middleware(RequestGuard)

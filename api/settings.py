@@ -20,6 +20,15 @@ class ApiSettings(StorageSettings):
     max_upload_bytes: int = Field(
         20 * 2**30, ge=1, description="Largest capture that is taken, in bytes."
     )
+    max_uploads: int = Field(
+        64, ge=1, le=1000, description="Uploads that are taken in side by side; more are a 503."
+    )
+    min_upload_bytes_per_s: int = Field(
+        8192, ge=0, description="An upload that is slower for a minute is given up; 0 for no limit."
+    )
+    small_body_s: float = Field(
+        30.0, gt=0, description="Longest that the body of any other call may take, in seconds."
+    )
     min_free_bytes: int = Field(
         2**30, ge=0, description="Bytes that an upload must leave free on the staging disk."
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import ExitStack
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -54,10 +55,12 @@ async def create_capture(
     """Upload a capture as multipart part `file`. What it is, the bytes decide."""
     settings = services.settings
     limits = Limits(settings.max_upload_bytes, settings.min_free_bytes)
-    body = Body(request.receive)
+    body = Body(request.receive, settings.min_upload_bytes_per_s)
     headers = request.headers
-    with staging_file(settings.staging_dir) as staging:
+    with ExitStack() as held:
         try:
+            held.enter_context(services.taking_an_upload())
+            staging = held.enter_context(staging_file(settings.staging_dir))
             received = await receive(
                 body,
                 headers.get("content-type"),

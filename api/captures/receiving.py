@@ -14,6 +14,7 @@ import hashlib
 import re
 import secrets
 import shutil
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,7 +40,8 @@ CHECK_DISK_BYTES = 64 << 20
 MAX_PARTS = 16
 MAX_OTHER_BYTES = 64 << 10
 FRAMING_BYTES = 1 << 20
-IDLE_S = 120.0
+IDLE_S = 60.0
+SLOW_START_S = 60.0
 LINGER_BYTES = 32 << 20
 LINGER_S = 5.0
 SUFFIX = ".upload"
@@ -220,26 +222,40 @@ def _malformed(error: FormParserError) -> ApiError:
     )
 
 
+def _stalled(detail: str) -> ApiError:
+    return ApiError(
+        detail,
+        code="upload_stalled",
+        hint="Send it again over a better connection; nothing of it was kept.",
+        status=408,
+    )
+
+
 class Body:
     """A request's body as it comes in."""
 
-    def __init__(self, receive: Receive) -> None:
+    def __init__(self, receive: Receive, min_bytes_per_s: int = 0) -> None:
+        """min_bytes_per_s: what is slower, on the whole, after SLOW_START_S is given up."""
         self._receive = receive
+        self._min_bytes_per_s = min_bytes_per_s
+        self._began = time.monotonic()
+        self._taken = 0
         self._ended = False
 
     async def chunks(self) -> AsyncIterator[bytes]:
-        """The bytes. Raises ClientDisconnect, and ApiError where nothing comes for IDLE_S."""
+        """The bytes. Raises ClientDisconnect, and ApiError where they come too slowly."""
         while not self._ended:
             try:
                 async with asyncio.timeout(IDLE_S):
                     message = await self._receive()
             except TimeoutError as error:
-                raise ApiError(
-                    f"Nothing came for {IDLE_S:.0f} s.",
-                    code="upload_stalled",
-                    hint="Send it again over a better connection; nothing of it was kept.",
-                    status=408,
-                ) from error
+                raise _stalled(f"Nothing came for {IDLE_S:.0f} s.") from error
+            self._taken += len(message.get("body", b""))
+            seconds = time.monotonic() - self._began - SLOW_START_S
+            if seconds > 0 and self._taken < seconds * self._min_bytes_per_s:
+                raise _stalled(
+                    f"The upload is slower than {self._min_bytes_per_s:,} bytes a second."
+                )
             if message["type"] == "http.disconnect":
                 self._ended = True
                 raise ClientDisconnect

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import re
 import stat
 import struct
@@ -34,6 +35,7 @@ _READ_ERRORS = (
 """What `zipfile` raises for an archive that is damaged or lies about itself."""
 
 _LOCAL_HEADER_BYTES = 30
+_ENTRY_SIGNATURE = b"PK\x01\x02"
 _ENCRYPTED_BITS = 0x1 | 0x40 | 0x2000
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _SMALL_BYTES = 4 << 20
@@ -45,9 +47,11 @@ class ArchiveLimits:
     """How large an archive may be.
 
     max_ratio: unpacked to packed size, for entries and the whole; pictures hardly shrink at all.
+    max_directory_bytes: of the list of entries at its end, which is held in memory.
     """
 
     max_entries: int = 50_000
+    max_directory_bytes: int = 16 * 2**20
     max_unpacked_bytes: int = 20 * 2**30
     max_ratio: float = 100.0
 
@@ -172,10 +176,60 @@ def reading() -> Iterator[None]:
         raise damaged() from error
 
 
-def open_archive(path: Path) -> zipfile.ZipFile:
-    """Open a zip for reading; nothing in it is checked yet. Raises CaptureError archive_damaged."""
+class _CheckedReads(io.BufferedReader):
+    """A file whose reads are checked while `zipfile` looks for the list of entries.
+
+    It reads that list whole, in one piece, and makes an object of each entry: 50 times the list's
+    size in memory. So what it asks for, and how many entries came, is looked at in between.
+    """
+
+    limits: ArchiveLimits | None = None
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As any file's. Raises CaptureError archive_bomb."""
+        if self.limits is None:
+            return super().read(size)
+        most = self.limits.max_directory_bytes
+        found = super().read(most + 1 if size is None or size < 0 else min(size, most + 1))
+        if len(found) > most:
+            raise _bomb(
+                f"The archive's list of entries is larger than {most / 2**20:.0f} MiB.",
+                "Send fewer pictures.",
+            )
+        if found.count(_ENTRY_SIGNATURE) > self.limits.max_entries:
+            raise _bomb(
+                f"The archive has more than {self.limits.max_entries} entries.",
+                "Send fewer pictures.",
+            )
+        return found
+
+
+class _Archive(zipfile.ZipFile):
+    """A zip that was opened through checked reads; closing it closes the file."""
+
+    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
+        self._reads = _CheckedReads(io.FileIO(path))
+        self._reads.limits = limits
+        try:
+            super().__init__(self._reads)
+        except BaseException:
+            self._reads.close()
+            raise
+        self._reads.limits = None
+
+    def close(self) -> None:
+        """Close the archive and its file."""
+        super().close()
+        self._reads.close()
+
+
+def open_archive(path: Path, limits: ArchiveLimits | None = None) -> zipfile.ZipFile:
+    """Open a zip for reading; of what is in it only the length of its list was checked.
+
+    Raises CaptureError: archive_damaged, archive_bomb.
+    """
     with reading():
-        return zipfile.ZipFile(path)
+        return _Archive(path, limits or ArchiveLimits())
 
 
 def checked_entries(archive: zipfile.ZipFile, limits: ArchiveLimits) -> dict[str, zipfile.ZipInfo]:

@@ -89,7 +89,7 @@ def _unknown(head: bytes, filename: str) -> CaptureError:
 
 
 def _sniff_zip(path: Path, limits: ArchiveLimits) -> Sniffed:
-    with open_archive(path) as archive:
+    with open_archive(path, limits) as archive:
         entries = checked_entries(archive, limits)
         heads = {name: head_of(archive, info) for name, info in entries.items()}
     listing = Listing(heads)

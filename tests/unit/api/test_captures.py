@@ -11,9 +11,11 @@ import time
 import tracemalloc
 import zipfile
 from collections.abc import AsyncIterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from api.captures.receiving import (
@@ -236,6 +238,73 @@ def test_parts_are_found_wherever_the_stream_is_cut(tmp_path: Path, chunk: int) 
     name, size, sha256, kept = asyncio.run(_received(body, chunk, tmp_path, Limits(10**6, 0)))
     assert (name, size, kept) == ("w.mp4", len(content), content)
     assert sha256 == hashlib.sha256(content).hexdigest()
+
+
+def test_an_upload_that_is_too_slow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    moment = [1000.0]
+    monkeypatch.setattr("api.captures.receiving.time.monotonic", lambda: moment[0])
+
+    async def drips() -> dict[str, Any]:
+        moment[0] += 5.0
+        return {"type": "http.request", "body": bytes(1000), "more_body": True}
+
+    async def run(min_bytes_per_s: int) -> int:
+        taken = 0
+        async for chunk in Body(drips, min_bytes_per_s).chunks():
+            taken += len(chunk)
+            if taken == 100_000:
+                break
+        return taken
+
+    assert asyncio.run(run(180)) == 100_000  # 200 bytes a second
+    with pytest.raises(ApiError) as caught:
+        asyncio.run(run(1000))
+    assert (caught.value.status, caught.value.code) == (408, "upload_stalled")
+    assert moment[0] <= 1000 + 500 + 80, "a minute's patience, not more"
+
+
+def test_no_more_uploads_come_in_than_may(tmp_path: Path) -> None:
+    server = LiveServer(settings_for(tmp_path / "home", max_uploads=2))
+    server.start()
+    head = (
+        "POST /v1/captures HTTP/1.1\r\nHost: test\r\nContent-Length: 9000000\r\n"
+        f"Authorization: Bearer {KEY}\r\nContent-Type: {FORM['Content-Type']}\r\n\r\n"
+    ).encode()
+    try:
+        with (
+            httpx.Client(base_url=server.url, headers={"Authorization": f"Bearer {KEY}"}) as http,
+            ExitStack() as held,
+        ):
+            for _ in range(2):
+                slow = held.enter_context(socket.create_connection(("127.0.0.1", server.port)))
+                slow.sendall(head + b"--")
+            wait_until(lambda: len([*server.settings.staging_dir.glob("*.upload")]) == 2)
+            files = {"file": ("a.zip", zip_of_pictures())}
+            refused = http.post("/v1/captures", files=files)
+            problem(refused, 503, "uploads_busy")
+            assert refused.headers["retry-after"]
+            held.close()
+            wait_until(lambda: http.post("/v1/captures", files=files).status_code == 201)
+    finally:
+        server.stop()
+
+
+def test_a_small_body_that_does_not_end_is_given_up(tmp_path: Path) -> None:
+    server = LiveServer(settings_for(tmp_path / "home", small_body_s=0.3))
+    server.start()
+    try:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=10) as slow:
+            slow.sendall(
+                b"POST /v1/jobs HTTP/1.1\r\nHost: test\r\nContent-Length: 90\r\n"
+                b"Content-Type: application/json\r\n"
+                + f"Authorization: Bearer {KEY}\r\n\r\n".encode()
+                + b'{"capture_id": '
+            )
+            answer = slow.recv(4096)
+            assert answer.startswith(b"HTTP/1.1 408")
+            assert b"request_timeout" in answer + slow.recv(4096)
+    finally:
+        server.stop()
 
 
 def test_receiving_holds_little_memory(tmp_path: Path) -> None:

@@ -7,12 +7,13 @@ import stat
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 from pathlib import Path
 
 import pytest
 
-from pipelines.captures.archive_rules import ArchiveLimits
+from pipelines.captures.archive_rules import ArchiveLimits, open_archive
 from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError
 from tests.unit.pipelines.captures.archives import (
@@ -227,6 +228,47 @@ def test_cut_off_archive_is_damaged(tmp_path: Path) -> None:
     path = write_zip(tmp_path / "c", {f"{n}.jpg": picture(seed=n) for n in range(5)})
     path.write_bytes(path.read_bytes()[:4000])
     assert code_of(path) == "archive_damaged"
+
+
+def many_entries(path: Path, num: int, name_bytes: int) -> None:
+    """A zip of empty entries, written by hand: `zipfile` would take minutes."""
+    names = [b"%0*d" % (name_bytes, number) for number in range(num)]
+    with path.open("wb") as file:
+        file.write(struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 20, 0, 0, 0, 0, 0, 0, 0, 1, 0) + b"a")
+        start = file.tell()
+        for name in names:
+            numbers = (20, 20, 0, 0, 0, 0, 0, 0, 0, len(name), 0, 0, 0, 0, 0, 0)
+            file.write(struct.pack("<4sHHHHHHIIIHHHHHII", b"PK\1\2", *numbers) + name)
+        size = file.tell() - start
+        last = min(num, 0xFFFF)
+        file.write(struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, last, last, size, start, 0))
+
+
+@pytest.mark.parametrize(("num", "name_bytes"), [(300_000, 20), (9_000, 2_000)])
+def test_a_list_of_entries_is_bounded_before_it_is_in_memory(
+    tmp_path: Path, num: int, name_bytes: int
+) -> None:
+    many_entries(tmp_path / "many.zip", num, name_bytes)
+    tracemalloc.start()
+    with pytest.raises(CaptureError) as caught:
+        sniff(tmp_path / "many.zip", "many.zip")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert caught.value.code == "archive_bomb"
+    assert peak < 40 << 20
+
+
+def test_a_closed_archive_holds_no_file(tmp_path: Path) -> None:
+    many_entries(tmp_path / "few.zip", 3, 20)
+    before = len([*Path("/proc/self/fd").iterdir()])
+    for _ in range(20):
+        with open_archive(tmp_path / "few.zip") as archive:
+            assert len(archive.infolist()) == 3
+    (tmp_path / "cut.zip").write_bytes((tmp_path / "few.zip").read_bytes()[:-30])
+    for _ in range(20):
+        with pytest.raises(CaptureError):
+            open_archive(tmp_path / "cut.zip")
+    assert len([*Path("/proc/self/fd").iterdir()]) <= before
 
 
 def test_sniffing_loads_no_library_beyond_the_standard_one() -> None:
