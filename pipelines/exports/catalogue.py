@@ -14,6 +14,7 @@ KINDS = (
     "mesh",
     "video",
     "cameras",
+    "dataset",
 )
 """In the order in which they are listed and, where nothing runs side by side, made."""
 

@@ -17,6 +17,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,7 @@ _POINT = np.dtype(
     ]
 )
 """Of points3D.bin; how many images saw it, by their keypoints, is none."""
+_GREY = 127
 
 
 @dataclass(frozen=True)
@@ -72,17 +74,7 @@ class _Image:
 
 def write_colmap(path: Path, cameras: CamerasFile) -> None:
     """Write the zip, without points. Raises ExportError for a lens that COLMAP has no model for."""
-    lenses = [_camera(lens) for lens in cameras.cameras]
-    images = _images(cameras)
-    files = {
-        "cameras.txt": _cameras_text(lenses),
-        "images.txt": _images_text(images),
-        "points3D.txt": b"# No points.\n",
-        "cameras.bin": _cameras_binary(lenses),
-        "images.bin": _images_binary(images),
-        "points3D.bin": struct.pack("<Q", 0),
-    }
-    _write(path, files)
+    _write(path, model_files(cameras, "text") | model_files(cameras, "binary"))
 
 
 def write_colmap_points(
@@ -92,15 +84,40 @@ def write_colmap_points(
 
     points: [P, 3] world. colors: [P, 3], sRGB. Raises ExportError as `check_lenses`.
     """
-    records = np.zeros(len(points), _POINT)
-    records["id"] = np.arange(1, len(points) + 1)
-    records["xyz"], records["rgb"] = points, colors
-    files = {
-        "cameras.bin": _cameras_binary([_camera(lens) for lens in cameras.cameras]),
-        "images.bin": _images_binary(_images(cameras)),
-        "points3D.bin": struct.pack("<Q", len(points)) + records.tobytes(),
-    }
-    _write(path, files)
+    _write(path, model_files(cameras, "binary", points, colors))
+
+
+def model_files(
+    cameras: CamerasFile,
+    form: Literal["text", "binary"],
+    points: Floats | None = None,
+    colors: NDArray[np.uint8] | None = None,
+) -> dict[str, bytes]:
+    """The three files of a model in one form, by their names in an archive.
+
+    points: [P, 3] world, or None. colors: [P, 3], sRGB; grey where there are none.
+    Raises ExportError as `check_lenses`.
+    """
+    lenses = [_camera(lens) for lens in cameras.cameras]
+    images = _images(cameras)
+    places = np.zeros((0, 3)) if points is None else points
+    records = np.zeros(len(places), _POINT)
+    records["id"] = np.arange(1, len(places) + 1)
+    records["xyz"] = places
+    records["rgb"] = _GREY if colors is None else colors
+    if form == "text":
+        files = {
+            "cameras.txt": _cameras_text(lenses),
+            "images.txt": _images_text(images),
+            "points3D.txt": _points_text(records),
+        }
+    else:
+        files = {
+            "cameras.bin": _cameras_binary(lenses),
+            "images.bin": _images_binary(images),
+            "points3D.bin": struct.pack("<Q", len(records)) + records.tobytes(),
+        }
+    return {f"{_FOLDER}/{name}": data for name, data in files.items()}
 
 
 def check_lenses(cameras: CamerasFile) -> None:
@@ -112,7 +129,7 @@ def check_lenses(cameras: CamerasFile) -> None:
 def _write(path: Path, files: dict[str, bytes]) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in files.items():
-            archive.writestr(entry(f"{_FOLDER}/{name}"), data)
+            archive.writestr(entry(name), data)
 
 
 def _camera(lens: Intrinsics) -> _Camera:
@@ -158,6 +175,16 @@ def _images_text(images: Sequence[_Image]) -> bytes:
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
     for number, image in enumerate(images, start=1):
         lines += [f"{number} {_numbers((*image.q, *image.t))} {image.camera} {image.name}", ""]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _points_text(records: NDArray[np.void]) -> bytes:
+    """A line a point, seen by no image."""
+    lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    lines += [
+        f"{row['id']} {_numbers(row['xyz'])} {' '.join(map(str, row['rgb']))} 0.0"
+        for row in records
+    ]
     return ("\n".join(lines) + "\n").encode()
 
 

@@ -3,8 +3,8 @@
 `transform_matrix` is world_from_camera, 4x4, OpenGL axes, in the world of `cameras.json`: +Z up
 already, so `orientation_override` is "none". Pixel coordinates are the same too: the centre of the
 top-left pixel is (0.5, 0.5). Paths are those of `cameras.json`, relative to the folder that holds
-`images/`. Where the capture's own file had been moved into its world (`applied_transform`,
-`applied_scale`), both are passed on.
+`images/`, `masks/` and `depth/`. Where the capture's own file had been moved into its world
+(`applied_transform`, `applied_scale`), both are passed on.
 
 Source: nerfstudio, docs/quickstart/data_conventions.md and data/dataparsers/nerfstudio_dataparser.
 """
@@ -25,6 +25,18 @@ _PASSED_ON = ("applied_transform", "applied_scale")
 
 def write_transforms(path: Path, cameras: CamerasFile) -> None:
     """Write the file. Raises ExportError where the lenses cannot stand in one such file."""
+    path.write_text(transforms_text(cameras), "utf-8")
+
+
+def transforms_text(
+    cameras: CamerasFile, *, depth_unit: float | None = None, points: str | None = None
+) -> str:
+    """The content of the file.
+
+    depth_unit: world units a count of the 16-bit PNGs that the images' `depth` then names; None
+    where there are none. points: path of a point cloud in the same world, or None.
+    Raises ExportError where the lenses cannot stand in one such file.
+    """
     images = cameras.images
     lenses = [cameras.cameras[image.camera] for image in images]
     content: dict[str, Any] = {
@@ -32,6 +44,12 @@ def write_transforms(path: Path, cameras: CamerasFile) -> None:
         "orientation_override": "none",
         **{name: cameras.notes[name] for name in _PASSED_ON if name in cameras.notes},
     }
+    if points is not None:
+        content["ply_file_path"] = points
+    with_depth = depth_unit is not None and all(image.depth is not None for image in images)
+    if depth_unit is not None and with_depth:
+        # Who reads depth multiplies it by applied_scale, by which ours has been multiplied already.
+        content["depth_unit_scale_factor"] = depth_unit / content.get("applied_scale", 1.0)
     # An intrinsic is global or each frame's own, never both.
     shared = len(set(lenses)) == 1
     if shared:
@@ -42,6 +60,7 @@ def write_transforms(path: Path, cameras: CamerasFile) -> None:
         {
             "file_path": image.file,
             **({"mask_path": image.mask} if with_masks else {}),
+            **({"depth_file_path": image.depth} if with_depth else {}),
             **({} if image.timestamp_s is None else {"timestamp": image.timestamp_s}),
             "transform_matrix": [*map(list, image.world_from_camera), [0.0, 0.0, 0.0, 1.0]],
             "colmap_im_id": number,
@@ -49,7 +68,7 @@ def write_transforms(path: Path, cameras: CamerasFile) -> None:
         }
         for number, (image, lens) in enumerate(zip(images, lenses, strict=True), start=1)
     ]
-    path.write_text(json.dumps(content, indent=1), "utf-8")
+    return json.dumps(content, indent=1)
 
 
 def _camera_model(lenses: list[Intrinsics]) -> str:
