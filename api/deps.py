@@ -104,3 +104,8 @@ def require_key(
 
 CallerDep = Annotated[str, Depends(require_key)]
 """The id of the caller's key."""
+
+
+def actor_of(caller: str) -> str:
+    """A caller as events name it."""
+    return f"api-key:{caller}"

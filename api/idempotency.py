@@ -19,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 from starlette.responses import Response
 
-from api.deps import Services
+from api.deps import Services, actor_of
 from storage.idempotency import KeptAnswer, claim, keep, release, scope_of
 
 IdempotencyKey = Annotated[
@@ -83,7 +83,7 @@ def do_once(
         return KeptAnswer(status, view.model_dump_json(), location)
 
     if once.key is None:
-        with services.database.session_scope() as session:
+        with services.database.session_scope(actor_of(once.caller)) as session:
             answer = answer_in(session)
         return _response(answer, is_replayed=False)
     scope = scope_of(once.caller, once.call, once.key)
@@ -91,7 +91,7 @@ def do_once(
     if isinstance(held, KeptAnswer):
         return _response(held, is_replayed=True)
     try:
-        with services.database.session_scope() as session:
+        with services.database.session_scope(actor_of(once.caller)) as session:
             answer = answer_in(session)
             keep(session, scope, held, answer)
     except BaseException:

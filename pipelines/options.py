@@ -429,6 +429,27 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
     return resolved
 
 
+def revise_options(
+    preset: str, present: dict[str, dict[str, Any]], changes: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Complete options of a job that is run again: those that it has, with some changed.
+
+    present: as `resolve_options` gave them once. changes: nested `{stage: {option: value}}`; with
+    another `train.method` training begins with the preset's options. Raises as `resolve_options`.
+    """
+    kept = {
+        name: dict(values)
+        for name, values in present.items()
+        if name not in PRESETS[preset].without
+    }
+    kept.get("depth", {}).pop("held_out", None)  # follows train.data
+    present_method = kept.get("train", {}).get("method")
+    training = changes.get("train")
+    if isinstance(training, dict) and training.get("method", present_method) != present_method:
+        kept.pop("train", None)
+    return resolve_options(preset, merge(kept, changes))
+
+
 def _hold_out_the_same(resolved: dict[str, dict[str, Any]], overrides: dict[str, Any]) -> None:
     """What `train` holds out takes no part in `depth` either.
 

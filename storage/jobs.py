@@ -1,5 +1,6 @@
-"""A job's life: create, cancel, delete. `storage.claims` and `storage.leases` have what workers
-do to its stages.
+"""A job's life: create, cancel, retry, delete.
+
+What workers do to its stages is in `storage.claims` and `storage.leases`.
 
 Callers commit, and ring the bell (`storage.queue`) for stages that became ready after the commit.
 Reading is in `storage.queries`. `when` is for tests; it defaults to the database's clock.
@@ -7,22 +8,44 @@ Reading is in `storage.queries`. `when` is for tests; it defaults to the databas
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import delete
-from sqlalchemy.orm import Session
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session, joinedload, selectinload
 
 from storage.db import now
 from storage.errors import ConflictError, NotFoundError
 from storage.keys import job_prefix
 from storage.models import Capture, Event, Job, LogLine, PendingDeletion, StageRow, StageRun, new_id
 from storage.queue import resource_of
-from storage.transitions import drop_waiting, lock_job, record_event, set_job, settle
+from storage.states import JOB_TERMINAL
+from storage.transitions import (
+    drop_waiting,
+    lock_job,
+    record_event,
+    set_job,
+    set_stage,
+    settle,
+)
 
 MAX_ATTEMPTS = 3
+_UNTRIED: dict[str, Any] = {
+    "attempt": 0,
+    "not_before": None,
+    "progress": 0.0,
+    "message": "",
+    "heartbeat_at": None,
+    "progress_at": None,
+    "started_at": None,
+    "finished_at": None,
+    "error": None,
+    "output_prefix": None,
+    "summary": None,
+    "manifest": None,
+}
 
 
 @dataclass(frozen=True)
@@ -133,6 +156,64 @@ def request_cancel(session: Session, job_id: str, when: datetime | None = None) 
         state = "cancelling" if running else "cancelled"
         set_job(session, job, state, when, cancel_requested_at=when)
     return job
+
+
+def open_for_retry(session: Session, job_id: str) -> Job:
+    """A job that is over, locked, with its stages, their manifests and its capture's row.
+
+    Raises NotFoundError; ConflictError while it runs, or a stage of it has not stopped.
+    """
+    job, stages = lock_job(session, job_id)
+    if job.state not in JOB_TERMINAL or any(row.state == "running" for row in stages):
+        raise ConflictError(f"Job {job_id} is not over yet.")
+    session.get(Capture, job.capture_id, with_for_update={"read": True}, populate_existing=True)
+    query = select(Job).where(Job.id == job_id)
+    loaded = selectinload(Job.stages).undefer(StageRow.manifest)
+    return session.scalars(query.options(joinedload(Job.capture), loaded)).one()
+
+
+def retry_job(
+    session: Session,
+    job: Job,
+    redo: Collection[str],
+    options: dict[str, Any],
+    *,
+    changes: dict[str, Any],
+    from_stage: str | None = None,
+    when: datetime | None = None,
+) -> list[str]:
+    """Run some stages of a job again, as its next generation. Ids newly ready.
+
+    job: from `open_for_retry`, in the same session. redo: their names; with a stage all that wait
+    for it. options: of all stages, as they are to be from now on; changes: what is new in them,
+    for the record. What the other stages published stays and is used; so does the checkpoint of a
+    stage that had not succeeded, which decides itself whether it fits. What a stage that is done
+    again had published stays in the store until it has succeeded anew.
+    """
+    when = when or now(session)
+    stages = list(job.stages)
+    for row in stages:
+        if row.name not in redo:
+            continue
+        if row.state == "failed" and row.output_prefix:
+            session.add(PendingDeletion(prefix=row.output_prefix, created_at=when))
+        set_stage(session, row, "blocked", when, reason="retry", **_UNTRIED)
+    record = {"generation": job.generation + 1, "from_stage": from_stage, "options": changes}
+    set_job(
+        session,
+        job,
+        "queued",
+        when,
+        reason="retry",
+        data={**record, "stages": [row.name for row in stages if row.name in redo]},
+        generation=job.generation + 1,
+        options=options,
+        error=None,
+        started_at=None,
+        finished_at=None,
+        cancel_requested_at=None,
+    )
+    return settle(session, job, stages, when)
 
 
 def delete_job(session: Session, job_id: str, when: datetime | None = None) -> None:

@@ -8,11 +8,13 @@ old state in the UPDATE itself and is checked against these tables.
                 |        |         |-> failed       no attempts left, or not worth another
             (create)     |         |-> cancelled
                  blocked, ready -> cancelled        the job was cancelled, or failed elsewhere
+        succeeded, failed, cancelled -> blocked     the job is retried, and this stage with it
                  skipped                            given at creation: no use for it in this job
 
     job:    queued -> running -> succeeded | failed
             queued -> cancelled
             running -> cancelling -> cancelled      (at once where no stage is running)
+            succeeded, failed, cancelled -> queued  retried: a new generation
 """
 
 from __future__ import annotations
@@ -24,9 +26,9 @@ STAGE_TRANSITIONS: MappingProxyType[str, frozenset[str]] = MappingProxyType(
         "blocked": frozenset({"ready", "cancelled"}),
         "ready": frozenset({"running", "cancelled"}),
         "running": frozenset({"ready", "succeeded", "failed", "cancelled"}),
-        "succeeded": frozenset(),
-        "failed": frozenset(),
-        "cancelled": frozenset(),
+        "succeeded": frozenset({"blocked"}),
+        "failed": frozenset({"blocked"}),
+        "cancelled": frozenset({"blocked"}),
         "skipped": frozenset(),
     }
 )
@@ -35,15 +37,15 @@ JOB_TRANSITIONS: MappingProxyType[str, frozenset[str]] = MappingProxyType(
         "queued": frozenset({"running", "cancelled"}),
         "running": frozenset({"succeeded", "failed", "cancelling", "cancelled"}),
         "cancelling": frozenset({"cancelled"}),
-        "succeeded": frozenset(),
-        "failed": frozenset(),
-        "cancelled": frozenset(),
+        "succeeded": frozenset({"queued"}),
+        "failed": frozenset({"queued"}),
+        "cancelled": frozenset({"queued"}),
     }
 )
 STAGE_STATES = tuple(STAGE_TRANSITIONS)
 JOB_STATES = tuple(JOB_TRANSITIONS)
 STAGE_DONE = frozenset({"succeeded", "skipped"})
-JOB_TERMINAL = frozenset(state for state, following in JOB_TRANSITIONS.items() if not following)
+JOB_TERMINAL = frozenset({"succeeded", "failed", "cancelled"})
 JOB_LIVE = frozenset(JOB_STATES) - JOB_TERMINAL
 
 

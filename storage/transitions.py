@@ -8,7 +8,9 @@ transaction. Only those three modules use this one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
+from types import MappingProxyType
 from typing import Any, cast
 
 from sqlalchemy import CursorResult, select, update
@@ -115,8 +117,16 @@ def set_stage(
 
 
 def set_job(
-    session: Session, job: Job, state: str, when: datetime, *, reason: str = "", **values: Any
+    session: Session,
+    job: Job,
+    state: str,
+    when: datetime,
+    *,
+    reason: str = "",
+    data: Mapping[str, Any] = MappingProxyType({}),
+    **values: Any,
 ) -> None:
+    """Compare-and-set on the state. data: what the event says besides."""
     check_transition("job", job.state, state)
     old = job.state
     if state in JOB_TERMINAL:
@@ -127,7 +137,7 @@ def set_job(
         raise ConflictError(f"job {job.id} is no longer {old}")
     if values.get("error"):
         reason = reason or str(values["error"].get("code", ""))
-    record_event(session, job.id, f"job.{state}", when, reason=reason, was=old)
+    record_event(session, job.id, f"job.{state}", when, reason=reason, was=old, **data)
 
 
 def _is_done(name: str, by_name: dict[str, StageRow]) -> bool:

@@ -35,6 +35,7 @@ API_MAY_IMPORT = (
     "pipelines.options",
     "pipelines.registry",
     "pipelines.stage",
+    "pipelines.manifest",
     "pipelines.errors",
     "pipelines.captures.sniff",
     "pipelines.captures.catalogue",

@@ -4,6 +4,8 @@
     nerfworks submit FILE             upload, start a job; --wait and --download go on to the end
     nerfworks submit --capture ID     the same on a capture that is there
     nerfworks status | watch | logs | download [JOB]     the newest job where none is named
+    nerfworks events [JOB]            what happened to it: when, who, why
+    nerfworks retry JOB               once more, from what failed or what --set changes
     nerfworks cancel | delete JOB
     nerfworks list | captures | presets
 
@@ -40,6 +42,7 @@ from api.client.display import (
     clean,
     print_captures,
     print_error,
+    print_events,
     print_job,
     print_jobs,
     print_results,
@@ -205,6 +208,24 @@ def cancel(client: Client, args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
+def retry(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Run a job that is over again, from what failed or what changes."""
+    job = client.retry(args.job, args.from_stage, _options(args.set))
+    again = [stage.name for stage in job.stages if stage.state in ("ready", "blocked")]
+    console.print(f"Job {job.id} runs again: {', '.join(again)}", highlight=False)
+    if args.wait or args.download is not None:
+        folder = None if args.download is None else Path(args.download)
+        return _watch(client, job.id, folder, console)
+    console.print(f"See it: nerfworks watch {job.id}", highlight=False)
+    return OK
+
+
+def events(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Print what happened to a job: when, what, who, why."""
+    print_events(client.events(_job_of(client, args)), console)
+    return OK
+
+
 def delete(client: Client, args: argparse.Namespace, console: Console) -> int:
     """Delete a job and its bytes."""
     client.delete_job(args.job)
@@ -290,6 +311,12 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     one.add_argument("--follow", action="store_true", help="go on until the job is over")
     command("download", download, "newest").add_argument("folder", nargs="?", metavar="DIR")
     command("cancel", cancel, "named")
+    one = command("retry", retry, "named")
+    one.add_argument("--from", dest="from_stage", metavar="STAGE", help="begin with this stage")
+    one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
+    one.add_argument("--wait", action="store_true", help="show the job until it is over")
+    one.add_argument("--download", metavar="DIR", help="wait, then download the results there")
+    command("events", events, "newest")
     command("delete", delete, "named")
     one = command("list", list_jobs)
     one.add_argument("--state", help="only jobs in this state")

@@ -26,6 +26,7 @@ from api.client.models import (
     Capture,
     ChecksumMismatch,
     ConnectionFailed,
+    Event,
     Job,
     JobError,
     JobFailed,
@@ -58,6 +59,7 @@ __all__ = [
     "ChecksumMismatch",
     "Client",
     "ConnectionFailed",
+    "Event",
     "Job",
     "JobError",
     "JobFailed",
@@ -233,6 +235,33 @@ class Client:
         """Ask a job to stop."""
         answer = self._wire.send(lambda: self._wire.http.post(f"/v1/jobs/{segment(job_id)}/cancel"))
         return Job.model_validate(checked(answer).json())
+
+    def retry(
+        self,
+        job_id: str,
+        from_stage: str | None = None,
+        options: dict[str, Any] | None = None,
+        *,
+        idempotency_key: str | None = None,
+    ) -> Job:
+        """Run a job that is over again, once, however often the call had to be sent.
+
+        What still holds is used. options: {stage: {option: value}}.
+        """
+        wanted: dict[str, Any] = {"options": options or {}}
+        wanted |= {"from_stage": from_stage} if from_stage else {}
+        path = f"/v1/jobs/{segment(job_id)}/retry"
+        once = once_header(idempotency_key)
+        answer = self._wire.send(lambda: self._wire.http.post(path, json=wanted, headers=once))
+        return Job.model_validate(checked(answer).json())
+
+    def events(self, job_id: str, after: int = 0) -> Iterator[Event]:
+        """What happened to a job, oldest first, page by page. after: a `seq` to go on from."""
+        following: int | None = after
+        while following is not None:
+            page = self._get(f"/v1/jobs/{segment(job_id)}/events", {"after": following})
+            yield from (Event.model_validate(item) for item in page["items"])
+            following = page["next"]
 
     def delete_job(self, job_id: str) -> None:
         """Delete a job and its bytes."""

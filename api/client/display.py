@@ -22,6 +22,7 @@ from rich.progress import (
 from rich.table import Table
 
 from api.client.client import Artifact, Capture, Client, Job, Stage
+from api.client.models import Event
 
 PLAIN_EVERY_S = 15.0
 _STYLES = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}
@@ -166,6 +167,15 @@ def transfer_bar(console: Console, verb: str) -> Iterator[Any]:
 
     with progress:
         yield report
+
+
+def print_events(events: Iterable[Event], console: Console) -> None:
+    """What happened, a line each."""
+    for event in events:
+        what = event.kind if event.stage is None else f"{event.stage}: {event.kind}"
+        parts = [what, event.actor, event.reason]
+        line = "  ".join(clean(part) for part in parts if part)
+        console.print(f"{event.created_at:%Y-%m-%d %H:%M:%S}  {line}", highlight=False)
 
 
 def print_job(job: Job, console: Console) -> None:

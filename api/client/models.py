@@ -45,6 +45,7 @@ class Stage(_Model):
     eta_s: float | None
     attempt: int
     message: str
+    progress_at: datetime | None = None
     started_at: datetime | None
     finished_at: datetime | None
 
@@ -85,6 +86,7 @@ class Job(_Model):
 
     id: str
     state: str
+    generation: int = 1
     preset: str
     preset_reason: str
     options: dict[str, Any]
@@ -121,6 +123,18 @@ class Presets(_Model):
     items: list[Preset]
     default: str
     default_reason: str
+
+
+class Event(_Model):
+    """Something that happened to a job. kind: "job.STATE" or "stage.STATE"."""
+
+    seq: int
+    created_at: datetime
+    kind: str
+    stage: str | None
+    actor: str
+    reason: str
+    data: dict[str, Any]
 
 
 class LogPage(_Model):

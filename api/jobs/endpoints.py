@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Body, Query, Request, Response
 
 from api.deps import CallerDep, ServicesDep
 from api.errors import responses
@@ -12,6 +12,8 @@ from api.idempotency import IdempotencyKey, Once
 from api.ids import JobId, LabelFilter
 from api.jobs import service
 from api.jobs.schemas import (
+    EventPage,
+    EventView,
     JobPage,
     JobPlan,
     JobRequest,
@@ -20,6 +22,7 @@ from api.jobs.schemas import (
     JobView,
     JobWish,
     LogView,
+    RetryRequest,
     StageName,
 )
 from storage import queries, records
@@ -83,14 +86,56 @@ def get_job(job_id: JobId, services: ServicesDep, request: Request, response: Re
 
 @router.post("/{job_id}/cancel", status_code=202, responses=responses(404, 409))
 def cancel_job(
-    job_id: JobId, services: ServicesDep, request: Request, response: Response
+    job_id: JobId,
+    services: ServicesDep,
+    caller: CallerDep,
+    request: Request,
+    response: Response,
 ) -> JobView:
     """Ask a job to stop; asking twice changes nothing. The running stage stops within 10 s."""
-    service.cancel(services, job_id)
+    service.cancel(services, job_id, caller)
     with services.database.read_scope() as session:
         job = service.view(services, session, job_id, request)
     _hint_poll(response, job)
     return job
+
+
+@router.post(
+    "/{job_id}/retry", status_code=202, responses=responses(404, 409), response_model=JobView
+)
+def retry_job(
+    job_id: JobId,
+    services: ServicesDep,
+    caller: CallerDep,
+    request: Request,
+    wanted: Annotated[RetryRequest | None, Body()] = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """Run a job that is over again, from what failed or from where options change its results.
+
+    What still holds is used as it is: same stage version, options, inputs and seed.
+    """
+    wanted = wanted or RetryRequest()
+    call = f"POST /v1/jobs/{job_id}/retry"
+    once = Once.of(caller, call, idempotency_key, wanted.model_dump_json())
+    answer = service.retry(services, job_id, wanted, once, request)
+    answer.headers["Retry-After"] = POLL_S
+    return answer
+
+
+@router.get("/{job_id}/events", responses=responses(404))
+def list_job_events(
+    job_id: JobId,
+    services: ServicesDep,
+    after: Annotated[int, Query(ge=0, lt=2**62, description="Events behind this `seq`.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 200,
+) -> EventPage:
+    """What happened to a job, in order: when, who, why."""
+    with services.database.read_scope() as session:
+        queries.get_job(session, job_id)
+        found = queries.list_events(session, job_id, after, limit + 1)
+    items = [EventView.model_validate(event) for event in found[:limit]]
+    return EventPage(items=items, next=items[-1].seq if len(found) > limit else None)
 
 
 @router.delete("/{job_id}", status_code=204, responses=responses(404, 409))

@@ -78,6 +78,28 @@ class JobPlan(BaseModel):
     )
 
 
+class RetryRequest(BaseModel):
+    """What to do differently when a job is run again."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {},
+                {"from_stage": "mesh"},
+                {"options": {"train": {"max_steps": 4000}}},
+            ]
+        },
+    )
+
+    from_stage: StageName | None = Field(
+        None, description="Begin with this stage even where its result would hold."
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="{stage: {option: value}}, laid over the job's options."
+    )
+
+
 class JobErrorView(BaseModel):
     """Why a job failed: what failed, on what, what to do."""
 
@@ -99,6 +121,7 @@ class StageView(BaseModel):
     eta_s: float | None = Field(description="Seconds left, as far as that is known.")
     attempt: int = Field(description="Which try this is; 0 before the first.")
     message: str = Field(description="What it is doing.")
+    progress_at: datetime | None = Field(description="When it last got on.")
     started_at: datetime | None
     finished_at: datetime | None
 
@@ -108,6 +131,7 @@ class JobSummary(BaseModel):
 
     id: str
     state: JobState
+    generation: int = Field(description="1, and one more with every retry.")
     preset: str
     preset_reason: str = Field(description="Why this preset: asked for, or chosen because of ...")
     options: dict[str, Any] = Field(description="The complete options of every stage.")
@@ -133,6 +157,7 @@ class JobSummary(BaseModel):
         return {
             "id": job.id,
             "state": job.state,
+            "generation": job.generation,
             "preset": job.preset,
             "preset_reason": job.preset_reason,
             "options": job.options,
@@ -168,6 +193,27 @@ class JobPage(BaseModel):
 
     items: list[JobSummary]
     next_cursor: str | None = Field(description="Give it as `cursor` for the next page.")
+
+
+class EventView(BaseModel):
+    """Something that happened to a job."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    seq: int = Field(description="Rises with every event of the service.")
+    created_at: datetime
+    kind: str = Field(description='"job.STATE" or "stage.STATE": the state that was entered.')
+    stage: str | None
+    actor: str = Field(description='Who: "worker:...", "reaper:...", "api-key:ID" or "service".')
+    reason: str = Field(description="Why, in a word or an error's code; may be empty.")
+    data: dict[str, Any] = Field(description="The state before (`was`), attempt, outcome, error.")
+
+
+class EventPage(BaseModel):
+    """Events of a job, oldest first."""
+
+    items: list[EventView]
+    next: int | None = Field(description="Give it as `after` for what follows; null: no more yet.")
 
 
 class LogView(BaseModel):

@@ -7,9 +7,10 @@ from sqlalchemy.orm import Session
 from starlette.responses import Response
 
 from api.artifacts import service as artifacts
-from api.deps import DELETE_WAIT_S, Services
+from api.deps import DELETE_WAIT_S, Services, actor_of
 from api.idempotency import Once, do_once
-from api.jobs.schemas import JobPlan, JobRequest, JobView, JobWish
+from api.jobs import retrying
+from api.jobs.schemas import JobPlan, JobRequest, JobView, JobWish, RetryRequest
 from api.problems import ConflictedError, FieldProblem, InvalidRequestError
 from pipelines.options import PRESETS, resolve_options, stages_skipped
 from pipelines.registry import STAGE_NAMES, STAGES
@@ -107,9 +108,27 @@ def view(services: Services, session: Session, job_id: str, request: Request) ->
     )
 
 
-def cancel(services: Services, job_id: str) -> None:
+def retry(
+    services: Services, job_id: str, wanted: RetryRequest, once: Once, request: Request
+) -> Response:
+    """Run a job that is over again, once. Raises what `retrying.retry` raises."""
+    ready: list[str] = []
+
+    def make(session: Session) -> tuple[JobView, str]:
+        ready.extend(retrying.retry(session, job_id, wanted))
+        session.flush()
+        session.expire_all()  # the answer is what the database now holds
+        return view(services, session, job_id, request), f"/v1/jobs/{job_id}"
+
+    done = do_once(services, once, 202, make)
+    if not done.is_replayed:
+        services.bell.ring(ready)
+    return done.response
+
+
+def cancel(services: Services, job_id: str, caller: str) -> None:
     """Ask a job to stop. Raises ConflictedError where it ended otherwise already."""
-    with services.database.session_scope() as session:
+    with services.database.session_scope(actor_of(caller)) as session:
         job = jobs.request_cancel(session, job_id)
         _check_cancelled(job)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import threading
 import time
 import zipfile
@@ -21,11 +22,13 @@ from PIL import Image
 from api.app import create_app
 from api.deps import Services
 from api.settings import ApiSettings
-from pipelines.registry import STAGES
+from pipelines.manifest import fingerprint
+from pipelines.registry import STAGES, get_stage
 from storage.claims import claim_stage
 from storage.jobs import stage_id
 from storage.keys import attempt_prefix
 from storage.leases import succeed_stage
+from storage.models import Job
 from storage.queries import get_job
 from tests.services import free_port
 
@@ -128,7 +131,22 @@ def run_stage(services: Services, job_id: str, name: str, files: dict[str, bytes
     summaries = {"evaluate": summary, "assess": assets}
     manifest = {"files": entries, "summary": summaries.get(name, {})}
     with services.database.session_scope() as session:
+        manifest |= made_from(get_job(session, job_id, manifests=True), name, entries)
         succeed_stage(session, claim, manifest=manifest, output_prefix=prefix)
+
+
+def made_from(job: Job, name: str, entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the manifest of a stage says of its inputs, as `pipelines.manifest` writes it."""
+    stage = get_stage(name)
+    made = {row.name: row.manifest for row in job.stages if row.manifest}
+    inputs = {read: made[read] for read in stage.reads if read in made}
+    if not stage.after:
+        inputs["input"] = {"content": job.capture_id}
+    return {
+        "fingerprint": fingerprint(stage, job.options[name], inputs, seed=job.seed),
+        "content": hashlib.sha256(json.dumps(entries).encode()).hexdigest(),
+        "inputs": {read: found["content"] for read, found in inputs.items()},
+    }
 
 
 NUM_ARTIFACTS = sum(len(stage.artifacts) for stage in STAGES)

@@ -35,7 +35,17 @@ def test_new_job_is_queued_with_all_its_stages(service: Service) -> None:
     assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
     assert float(answer.headers["retry-after"]) > 0
     assert set(job) == {
-        *("id", "state", "preset", "preset_reason", "options", "labels", "capture_id", "stages"),
+        *(
+            "id",
+            "state",
+            "generation",
+            "preset",
+            "preset_reason",
+            "options",
+            "labels",
+            "capture_id",
+            "stages",
+        ),
         *("queue_position", "metrics", "assets", "error", "artifacts"),
         *("created_at", "started_at", "finished_at", "cancel_requested_at"),
     }
@@ -45,7 +55,8 @@ def test_new_job_is_queued_with_all_its_stages(service: Service) -> None:
     assert job["options"] == resolve_options("preview", {})
     assert [stage["name"] for stage in job["stages"]] == list(STAGE_NAMES)
     assert set(job["stages"][0]) == {
-        *("name", "state", "progress", "eta_s", "attempt", "message", "started_at", "finished_at")
+        *("name", "state", "progress", "eta_s", "attempt", "message", "progress_at"),
+        *("started_at", "finished_at"),
     }
     found = states(job)
     assert found["ingest"] == "ready"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -9,9 +10,18 @@ import pytest
 from storage.claims import Claim, claim_stage
 from storage.db import Database
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
-from storage.jobs import StageSeed, create_job, delete_job, request_cancel, stage_id
+from storage.jobs import (
+    StageSeed,
+    create_job,
+    delete_job,
+    open_for_retry,
+    request_cancel,
+    retry_job,
+    stage_id,
+)
 from storage.leases import (
     CAPS,
+    FailureReport,
     cancel_stage,
     crash_stage,
     fail_stage,
@@ -501,3 +511,82 @@ def test_history_keeps_what_a_later_claim_overwrites(database: Database) -> None
         ("stage.running", "worker:w2", ""),
         ("stage.succeeded", "worker:w2", ""),
     ]
+
+
+def test_a_retry_keeps_what_is_not_done_again(either_database: Database) -> None:
+    """Results, checkpoints, tokens and history stay; the failed attempt's report goes."""
+    database = either_database
+    job = new_job(database)
+    succeed(database, claim(database, job, "first"))
+    held = claim(database, job, "second", at=2)
+    with database.session_scope() as session:
+        save_checkpoint(session, held, "c1/")
+        fail_stage(
+            session,
+            held,
+            ERROR,
+            retryable=False,
+            report=FailureReport("failed/", []),
+            when=seconds(3),
+        )
+    with database.session_scope() as session:
+        found = open_for_retry(session, job)
+        changes = {"second": {"depth": 4}}
+        ready = retry_job(
+            session, found, {"second", "third"}, changes, changes=changes, when=seconds(9)
+        )
+        assert ready == [stage_id(job, "second")]
+    assert look(database, job) == {
+        "first": "succeeded",
+        "second": "ready",
+        "third": "blocked",
+        "job": "queued",
+    }
+    with database.read_scope() as session:
+        assert [row.prefix for row in session.query(PendingDeletion)] == ["failed/"]
+        assert get_job(session, job).options == changes
+    again = claim(database, job, "second", at=10)
+    assert (again.token, again.attempt) == (held.token + 1, 1)
+    with database.read_scope() as session:
+        work = stage_work(session, again)
+        assert work.checkpoint_prefix == "c1/"
+        assert work.inputs["first"].prefix == "p/"
+        assert [(run.generation, run.outcome) for run in list_runs(session, job)] == [
+            (1, "succeeded"),
+            (1, "error"),
+            (2, None),
+        ]
+    with pytest.raises(ConflictError), database.session_scope() as session:
+        open_for_retry(session, job)
+
+
+def test_a_retry_starts_the_counts_anew(database: Database) -> None:
+    job = new_job(database)
+    for at in (0.0, 1000.0, 2000.0):
+        last = end_badly(database, job, "killed", at)
+    assert last == "failed"
+    with database.session_scope() as session:
+        found = open_for_retry(session, job)
+        retry_job(session, found, {row.name for row in found.stages}, {}, changes={}, when=T0)
+    assert end_badly(database, job, "killed", 3000.0) == "ready"
+
+
+def test_of_two_retries_at_once_one_is_refused(either_database: Database) -> None:
+    database = either_database
+    job = new_job(database)
+    with database.session_scope() as session:
+        request_cancel(session, job)
+
+    def retry(_: int) -> bool:
+        try:
+            with database.session_scope() as session:
+                found = open_for_retry(session, job)
+                names = {row.name for row in found.stages}
+                return bool(retry_job(session, found, names, {}, changes={}))
+        except ConflictError:
+            return False
+
+    with ThreadPoolExecutor(4) as pool:
+        assert sum(pool.map(retry, range(4))) == 1
+    with database.read_scope() as session:
+        assert get_job(session, job).generation == 2

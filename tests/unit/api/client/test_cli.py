@@ -119,6 +119,29 @@ def test_submit_and_download_ends_with_files_and_tables(
     assert job.labels == {"a": "b"}
 
 
+def test_retry_says_what_runs_again_and_events_say_who_did_what(
+    command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["submit", str(archive), "--preset", "preview"]) == 0
+    job = newest(command)
+    finish_job(command.services, job, lambda name: b"x")
+    capsys.readouterr()
+    assert cli.main(["retry", job]) == 1
+    assert "nothing to do again" in capsys.readouterr().err
+    assert cli.main(["retry", job, "--from", "assess", "--set", "mesh.max_faces=4000"]) == 0
+    assert "runs again: mesh, assess, report" in capsys.readouterr().out
+    assert cli.main(["events"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "job.queued  api-key:" in lines[0]
+    assert any("mesh: stage.blocked  api-key:" in line and "retry" in line for line in lines)
+    with Client() as client:
+        seen = list(client.events(job))
+        assert len(seen) == len(lines)
+        assert [event.seq for event in client.events(job, seen[3].seq)] == [
+            event.seq for event in seen[4:]
+        ]
+
+
 def test_a_draft_is_shown_without_numbers_that_nobody_measured(
     command: LiveServer, archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,100 @@
+"""A job once more: what of it still holds, and what is run again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from api.jobs.schemas import RetryRequest
+from api.problems import ConflictedError, FieldProblem, InvalidRequestError, MissingError
+from pipelines.manifest import fingerprint
+from pipelines.options import PRESETS, revise_options
+from pipelines.registry import STAGE_NAMES, get_stage
+from storage import jobs
+from storage.models import Job, StageRow
+
+
+def _holds(row: StageRow, rows: dict[str, StageRow], options: dict[str, Any], seed: int) -> bool:
+    """Whether a stage would make what it has made: same version, options, inputs and seed."""
+    made = row.manifest
+    if row.state != "succeeded" or made is None or row.name not in STAGE_NAMES:
+        return False
+    if not {"fingerprint", "inputs"} <= set(made):
+        return False
+    inputs: dict[str, dict[str, Any]] = {}
+    for name, content in made["inputs"].items():
+        found = rows[name].manifest if name in rows else {"content": content}  # else the upload
+        if not found or "content" not in found:
+            return False
+        inputs[name] = found
+    wanted = fingerprint(get_stage(row.name), options, inputs, seed=seed)
+    return bool(wanted == made["fingerprint"])
+
+
+def stages_to_redo(
+    job: Job, options: dict[str, dict[str, Any]], from_stage: str | None = None
+) -> list[str]:
+    """The stages whose results do not hold with these options, in order, and all behind them.
+
+    from_stage: one that is run again in any case.
+    """
+    rows = {row.name: row for row in job.stages}
+    behind: set[str] = set()  # what is run again, and skipped stages that only pass it on
+    redo = []
+    for row in job.stages:
+        waits = not behind.isdisjoint(row.after)
+        if row.state == "skipped":
+            behind |= {row.name} if waits else set()
+        elif (
+            waits
+            or row.name == from_stage
+            or not _holds(row, rows, options.get(row.name, {}), job.seed)
+        ):
+            behind.add(row.name)
+            redo.append(row.name)
+    return redo
+
+
+def _reads_the_capture(name: str) -> bool:
+    """Whether a stage is given the uploaded bytes: it reads nothing, or only such stages."""
+    return all(not get_stage(earlier).reads for earlier in get_stage(name).reads)
+
+
+def retry(session: Session, job_id: str, wanted: RetryRequest) -> list[str]:
+    """Put a job that is over into the queue again. Ids of the stages that can start.
+
+    Raises NotFoundError, ConflictError (it is not over), ConflictedError (nothing is to be done),
+    MissingError (the capture is gone and needed), InvalidRequestError, OptionsError.
+    """
+    job = jobs.open_for_retry(session, job_id)
+    if job.preset not in PRESETS:
+        raise ConflictedError(
+            f"The job's preset {job.preset} is no more.",
+            code="preset_unknown",
+            hint="Start a new job on the capture.",
+        )
+    options = revise_options(job.preset, job.options, wanted.options)
+    from_stage = None if wanted.from_stage is None else str(wanted.from_stage)
+    if from_stage in {row.name for row in job.stages if row.state == "skipped"}:
+        raise InvalidRequestError(
+            f"The job has no stage {from_stage}: its capture or its preset has no use for it.",
+            code="stage_skipped",
+            errors=[FieldProblem(path="from_stage", detail="a stage that the job has")],
+        )
+    redo = stages_to_redo(job, options, from_stage)
+    if not redo:
+        raise ConflictedError(
+            "Every result of the job holds: there is nothing to do again.",
+            code="nothing_to_retry",
+            hint="Change an option, or name the stage to begin with in from_stage.",
+        )
+    if job.capture.deleted_at is not None and any(map(_reads_the_capture, redo)):
+        raise MissingError(
+            "The job's capture was deleted, and the job needs it again.",
+            code="capture_deleted",
+            hint="Upload the capture again and start a new job.",
+        )
+    return jobs.retry_job(
+        session, job, redo, options, changes=wanted.options, from_stage=from_stage
+    )
