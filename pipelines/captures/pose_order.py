@@ -35,8 +35,8 @@ Matches = tuple[Floats, Floats]
 
 MOST_OFF = 2.5e-3
 """Median distance from the epipolar line, in diagonals of the picture, up to which a reading fits.
-Right ones have 0.0003 (structure from motion) to 0.0012 (a headset's own tracking); rows that are
-one picture late 0.0047 and more, names as text where people count 0.015."""
+Right ones have 0.0002 (structure from motion) to 0.0013 (a headset's own tracking); rows that are
+one picture late 0.0047 and more, names as text where people count 0.009."""
 CLEARLY = 2.0
 """The next best reading must be off by this factor more."""
 _FEWEST_PAIRS = 3
@@ -44,7 +44,7 @@ _FEWEST_MATCHES = 24
 _LONG_SIDE_PX = 1000
 _FEATURES = 2500
 _THREADS = 2
-_SPOTS = 6
+_SPOTS = 12
 _GAPS = (1, 3)
 _APART = 0.5
 """How far apart the two cameras of a pair should be: near enough to see the same, far enough for

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from pipelines.captures.orders import frame_number
+from pipelines.sample.scene import pose_matrix
+from tests.app_writers import write_replica
 from tests.unit.pipelines.captures.archives import (
     K,
     depth_png,
@@ -239,6 +243,29 @@ def test_rows_that_may_be_several_pictures_are_refused_where_nothing_tells(tmp_p
     assert error.code == "poses_malformed"
     assert "as text" in error.message
     assert "leading zeros" in error.hint
+
+
+@pytest.mark.parametrize(("first", "rule"), [(0, "from 0"), (1, "from 1")])
+def test_numbers_in_names_tell_rows_where_pictures_are_missing(
+    tmp_path: Path, first: int, rule: str
+) -> None:
+    """Rows for 12 frames, pictures of seven, named by the number of their row."""
+    truth = write_replica(tmp_path / "whole.zip", num=12)
+    kept = [0, 2, 3, 5, 8, 9, 11]
+    files: Files = {}
+    with zipfile.ZipFile(tmp_path / "whole.zip") as archive:
+        for name in archive.namelist():
+            number = frame_number(name) if "results" in name else None
+            if number is None:
+                files[name] = archive.read(name)
+            elif number in kept:
+                digits = f"{number:06d}", f"{number + first:06d}"
+                files[name.replace(*digits)] = archive.read(name)
+    summary, ctx = ingest(tmp_path, files)
+    assert rule in summary["pose_order"]
+    expected = [pose_matrix(truth.images[number]) for number in kept]
+    np.testing.assert_allclose(poses_as_sent(ctx), expected, atol=1e-9)
+    assert warning_with(summary, "traj.txt has 12 poses, and there are 7 pictures")
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n", picture(16, 12)])
