@@ -81,6 +81,14 @@ def _unknown(head: bytes, filename: str) -> CaptureError:
             code="unknown_type",
             hint="Pack the photos as .zip and send that.",
         )
+    alone = claimed(Listing({filename.rpartition("/")[2] or "file": head}))
+    if alone is not None:
+        return CaptureError(
+            f"The file lists camera poses ({alone[0].kind}); the pictures that it lists are not "
+            "with it.",
+            code="unknown_type",
+            hint="Pack it into a .zip together with those pictures, and send that.",
+        )
     suffix = Path(filename).suffix[:12]
     named = f' (it is called "{suffix}")' if suffix.isprintable() and suffix else ""
     return CaptureError(

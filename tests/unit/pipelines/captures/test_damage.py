@@ -18,6 +18,7 @@ import pytest
 from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError, PipelineError, ToolError
 from pipelines.options import IngestOptions
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.stages.ingest import run
 from tests.sfm_writers import (
     colmap_files,
@@ -269,3 +270,68 @@ def test_damaged_videos(tmp_path: Path) -> None:
     data = make_clip(tmp_path / "a.mp4", "testsrc2=s=160x90:r=10:d=2").read_bytes()
     for n, changed in enumerate(mutations(data, 8, 6, data.index(b"moov"))):
         assert outcome(tmp_path / str(n), changed)
+
+
+def listing_of(kind: str, truth: CamerasFile) -> tuple[str, str]:
+    """A list of poses, its name in the archive and its text."""
+    odm = odm_files(truth)
+    return {
+        "colmap": (
+            "images.txt",
+            colmap_files(truth, form="text", folder="")["images.txt"].decode(),
+        ),
+        "opensfm": ("reconstruction.json", json.dumps([opensfm_reconstruction(truth)])),
+        "opendronemap": ("odm_report/shots.geojson", odm["odm_report/shots.geojson"].decode()),
+        "metashape": ("cameras.xml", metashape_xml(truth)),
+        "realitycapture": ("a.csv", realitycapture_csv(truth)),
+        "visualsfm": ("a.nvm", nvm_text(truth)),
+    }[kind]
+
+
+LISTS = ("colmap", "opensfm", "opendronemap", "metashape", "realitycapture", "visualsfm")
+
+
+@pytest.mark.parametrize("kind", LISTS)
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("IMG_", "IMG_", None),
+        ("IMG_", "C:\\shots\\IMG_", None),
+        ("IMG_", "..\\..\\IMG_", None),
+        ("IMG_", "../../../../IMG_", None),
+        ("IMG_", "/etc/../IMG_", None),
+        ("IMG_", "/etc/passwd/", "poses_missing"),
+        ("IMG_", "nothing_", "poses_missing"),
+        ("IMG_", "IMG_9.jpg/../nothing_", "poses_missing"),
+    ],
+)
+def test_paths_in_lists_of_poses(
+    tmp_path: Path, kind: str, old: str, new: str, expected: str | None
+) -> None:
+    """Paths of another machine are found by their end; none leads out of the archive."""
+    truth = walked(num=8)
+    name, text = listing_of(kind, truth)
+    files = pictures_of(truth) | (odm_files(truth) if kind == "opendronemap" else {})
+    if kind == "colmap":
+        files |= colmap_files(truth, form="text", folder="")
+    escaped = new.replace("\\", "\\\\") if name.endswith("json") else new
+    data = zipped(tmp_path, files | {name: text.replace(old, escaped)}, 0)
+    kind_read = {"opendronemap": "opensfm"}.get(kind, kind)
+    assert outcome(tmp_path / "job", data) == (expected or kind_read)
+
+
+@pytest.mark.parametrize("kind", LISTS)
+@pytest.mark.parametrize("kept", [0, 1, 3])
+def test_lists_that_end_early_or_hold_nothing(tmp_path: Path, kind: str, kept: int) -> None:
+    """A quarter, none or three quarters of the file: read with what is left, or refused."""
+    truth = walked(num=8)
+    name, text = listing_of(kind, truth)
+    files = pictures_of(truth) | (odm_files(truth) if kind == "opendronemap" else {})
+    if kind == "colmap":
+        files |= colmap_files(truth, form="text", folder="")
+    data = zipped(tmp_path, files | {name: text[: len(text) * kept // 4]}, 0)
+    found = outcome(tmp_path / "job", data)
+    refused = {"poses_malformed", "poses_missing", "too_few_images"}
+    left_alone = {"images"} if kept == 0 else set()
+    partly = {"realitycapture", "colmap"} if kept else set()  # their rows stand for themselves
+    assert found in refused | left_alone | partly

@@ -281,3 +281,24 @@ def test_sniffing_loads_no_library_beyond_the_standard_one() -> None:
     )
     foreign = [name for name in done.stdout.split() if not name.startswith(("_", "pipelines"))]
     assert foreign == []
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "kind"),
+    [
+        ("cameras.xml", b'<?xml version="1.0"?>\n<document version="1.5.0">', "metashape"),
+        ("export.csv", b"#name,x,y,alt,heading,pitch,roll,f", "realitycapture"),
+        ("model.nvm", b"NVM_V3 \n\n11\n", "visualsfm"),
+        ("reconstruction.json", b"[{", "opensfm"),
+    ],
+)
+def test_a_list_of_poses_alone_wants_its_pictures(
+    tmp_path: Path, name: str, head: bytes, kind: str
+) -> None:
+    path = tmp_path / "upload"
+    path.write_bytes(head)
+    with pytest.raises(CaptureError) as caught:
+        sniff(path, name)
+    assert caught.value.code == "unknown_type"
+    assert kind in caught.value.message
+    assert "together with those pictures" in caught.value.hint
