@@ -58,6 +58,7 @@ class RunHooks:
 
     on_progress: ProgressSink = _ignore_progress
     is_cancelled: Callable[[], bool] = _never
+    is_shutdown: Callable[[], bool] = _never
     on_checkpoint: Callable[[], None] = _ignore
     logger: logging.Logger = field(default_factory=lambda: logging.getLogger("nerfworks.stage"))
 
@@ -202,6 +203,7 @@ def run_stage(
         logger=hooks.logger,
         on_progress=hooks.on_progress,
         is_cancelled=hooks.is_cancelled,
+        is_shutdown=hooks.is_shutdown,
         on_checkpoint=hooks.on_checkpoint,
     )
     begun, compiled = time.monotonic(), _compile_seconds()

@@ -58,6 +58,7 @@ STAGES: tuple[Stage, ...] = (
         run="pipelines.stages.poses:run",
         options="PosesOptions",
         time_limit_s=6 * 3600.0,
+        stall_s=2 * 3600.0,  # one bundle adjustment of many pictures may be long and silent
     ),
     Stage(
         name="depth",

@@ -48,6 +48,7 @@ class Stage:
     options: name of its options class, which `pipelines.options.STAGE_OPTIONS` holds.
     needs_gpu: whether a GPU worker should take it when there is one.
     time_limit_s: hard limit for one attempt.
+    stall_s: an attempt that neither gets on nor writes a log line for so long is ended.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Stage:
     options: str
     needs_gpu: bool = False
     time_limit_s: float = 3600.0
+    stall_s: float = 1800.0
     artifacts: tuple[Artifact, ...] = ()
 
 
@@ -82,6 +84,8 @@ class StageContext:
     checkpoint: a folder that outlives a failed attempt, also when the next one runs elsewhere;
         a stage that calls `checkpoint_saved` after writing it can go on from there.
     seed: fixed per job, so that a run can be repeated.
+    is_shutdown: whether it is stopped only because its machine is needed: within seconds it may
+        save what the next attempt can go on from, before it reports progress again.
     """
 
     stage: str
@@ -92,6 +96,7 @@ class StageContext:
     logger: logging.Logger = field(default_factory=lambda: logging.getLogger("nerfworks.stage"))
     on_progress: ProgressSink = _ignore_progress
     is_cancelled: Callable[[], bool] = lambda: False
+    is_shutdown: Callable[[], bool] = lambda: False
     on_checkpoint: Callable[[], None] = lambda: None
 
     def progress(self, fraction: float, message: str = "", eta_s: float | None = None) -> None:

@@ -81,6 +81,26 @@ def time_limit_of(stage: str, limit_s: float) -> StageCrashedError:
     return StageCrashedError("time_limit", error.as_dict())
 
 
+def stalled_of(stage: str, silent_s: float) -> StageCrashedError:
+    """The stage's process lives, and nothing happens."""
+    error = PipelineError(
+        f"The stage {stage} did nothing for {silent_s:.0f} seconds.",
+        code="stalled",
+        hint="Look at the job's logs for the step that hangs; then retry the job.",
+    )
+    return StageCrashedError("stalled", error.as_dict())
+
+
+def disk_too_small(stage: str, free: int, needed: int) -> StageFailedError:
+    """There is no room for what the stage reads and writes."""
+    error = ResourceError(
+        f"The worker's disk has {free / 2**30:.1f} GiB free; {stage} needs {needed / 2**30:.1f}.",
+        code="disk_full",
+        hint="Free some space on the worker's disk; then retry the job.",
+    )
+    return StageFailedError(error.as_dict())
+
+
 def folder_in_use(stage: str) -> dict[str, Any]:
     """Another process works in the stage's folder on this machine."""
     return ResourceError(

@@ -122,10 +122,13 @@ class StageProcess:
         self._log_ended.clear()
         self._send({"do": "run", "run_id": run_id, **command})
 
-    def ask_to_cancel(self) -> None:
-        """Ask the stage to stop at its next report of progress."""
+    def ask_to_stop(self, reason: str) -> None:
+        """Ask the stage to stop at its next report of progress.
+
+        reason: "shutdown" lets it save what it has; "cancel" or "lost" means that nobody wants it.
+        """
         with contextlib.suppress(BrokenPipeError):
-            self._send({"do": "cancel", "run_id": self._run_id})
+            self._send({"do": "stop", "run_id": self._run_id, "reason": reason})
 
     def finish_log(self, timeout_s: float) -> None:
         """Wait until the last line of the run has arrived."""

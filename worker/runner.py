@@ -11,9 +11,10 @@ import importlib
 import logging
 import os
 import queue
+import shutil
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -45,7 +46,9 @@ from worker.outcomes import (
     StopRunError,
     UnknownOutcomeError,
     crash_of,
+    disk_too_small,
     failure_of,
+    stalled_of,
     time_limit_of,
 )
 from worker.predecessors import end_predecessor
@@ -65,6 +68,7 @@ MESSAGE_STEP_S = 0.25
 LOG_END_S = 2.0
 CHECKPOINT_END_S = 120.0
 RECORD_STEP_S = 1.0
+LOOK_S = 1.0
 Result = TypeVar("Result")
 
 
@@ -98,6 +102,39 @@ class Laps:
         moment = time.monotonic()
         self.seconds[name] = round(moment - self._ended, 3)
         self._ended = moment
+
+
+class Pulse:
+    """For how long a stage has shown no sign of life: progress that moved, a line, a checkpoint.
+
+    It grows only while somebody watches: a worker that was frozen, or asleep with its machine, does
+    not take its own silence for the stage's.
+    """
+
+    def __init__(self) -> None:
+        self._silent_s = 0.0
+        self._looked_at = time.monotonic()
+        self._said: tuple[Any, ...] = ()
+
+    def beat(self) -> None:
+        """There was a sign."""
+        self._silent_s = 0.0
+
+    def notice(self, message: Mapping[str, Any]) -> None:
+        """A message of the stage process came; the same progress as before is no sign."""
+        if message["type"] == "progress":
+            said = (message["fraction"], message["message"])
+            if said == self._said:
+                return
+            self._said = said
+        self.beat()
+
+    def silent_s(self, moment: float | None = None) -> float:
+        """Seconds without a sign so far. To be asked often."""
+        moment = time.monotonic() if moment is None else moment
+        self._silent_s += min(moment - self._looked_at, LOOK_S)
+        self._looked_at = moment
+        return self._silent_s
 
 
 class Runner:
@@ -200,6 +237,7 @@ class Runner:
             work = stage_work(session, claim)
         workspace = Workspace(self._work_dir / claim.job_id)
         end_predecessor(workspace.root, stage.name, claim.token)
+        self._check_disk(stage, work)
         write_job_file(workspace, work)
         if self._is_near_the_capture(stage):
             fetch_capture(self._store, workspace, work, guard)
@@ -223,6 +261,18 @@ class Runner:
         upload_folder(self._store, workspace.stage(stage.name), prefix, guard, workers=workers)
         laps.end("store_s")
         return {**manifest, "timings": {**manifest["timings"], **laps.seconds}}
+
+    def _check_disk(self, stage: Stage, work: StageWork) -> None:
+        """Refuse to begin what cannot end: its inputs, and some room to write, must fit."""
+        inputs = [work.inputs[name].manifest for name in stage.reads if name in work.inputs]
+        needed = sum(item["bytes"] for found in inputs for item in found.get("files", []))
+        needed += self._settings.min_free_bytes
+        if self._is_near_the_capture(stage):
+            needed += work.capture_bytes
+        self._work_dir.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(self._work_dir).free
+        if free < needed:
+            raise disk_too_small(stage.name, free, needed)
 
     def _lease_guard(self, keeper: LeaseKeeper) -> Callable[[], None]:
         """A checkpoint is worth keeping also when the worker shuts down."""
@@ -253,11 +303,16 @@ class Runner:
         uploader: CheckpointUploader,
         laps: Laps,
     ) -> dict[str, Any]:
-        process = self._ensure_process()
+        process, pulse = self._ensure_process(), Pulse()
+
+        def on_line(line: str) -> None:
+            pulse.beat()
+            keeper.log(line)
+
         try:
             process.start_run(
                 f"{claim.token}-{claim.stage_id}",
-                keeper.log,
+                on_line,
                 do="run",
                 stage=stage.name,
                 token=claim.token,
@@ -266,7 +321,7 @@ class Runner:
                 seed=work.seed,
                 threads=int(os.environ.get("OMP_NUM_THREADS") or self._threads()),
             )
-            return self._follow(process, stage, keeper, uploader, laps)
+            return self._follow(process, stage, keeper, uploader, laps, pulse)
         except BrokenPipeError:
             raise crash_of(stage.name, *process.exit_reason()) from None
         except StageCrashedError:
@@ -288,6 +343,7 @@ class Runner:
         keeper: LeaseKeeper,
         uploader: CheckpointUploader,
         laps: Laps,
+        pulse: Pulse,
     ) -> dict[str, Any]:
         """Take the process's messages until the stage has ended, or must."""
         guard = self._guard_of(keeper)
@@ -295,8 +351,8 @@ class Runner:
         while True:
             try:
                 guard()
-            except StopRunError:
-                self._stop(process)
+            except StopRunError as stop:
+                self._stop(process, stop.reason, uploader)
                 raise
             if time.monotonic() > deadline:
                 process.kill()
@@ -305,7 +361,11 @@ class Runner:
             try:
                 message = process.messages.get(timeout=MESSAGE_STEP_S)
             except queue.Empty:
+                if pulse.silent_s() > stage.stall_s:
+                    process.kill()
+                    raise stalled_of(stage.name, stage.stall_s) from None
                 continue
+            pulse.notice(message)
             kind = message["type"]
             if kind == "progress":
                 keeper.report(message["fraction"], message["message"], message["eta_s"])
@@ -326,16 +386,21 @@ class Runner:
             elif kind == "exit":
                 raise crash_of(stage.name, *process.exit_reason())
 
-    def _stop(self, process: StageProcess) -> None:
-        """Ask the stage to stop; kill it, and what it started, where it does not in time."""
-        process.ask_to_cancel()
+    def _stop(self, process: StageProcess, reason: str, uploader: CheckpointUploader) -> None:
+        """Ask the stage to stop; kill it, and what it started, where it does not in time.
+
+        A checkpoint that it still saves is kept where the uploader's guard lets it.
+        """
+        process.ask_to_stop(reason)
         deadline = time.monotonic() + self._settings.cancel_grace_s
         while (left := deadline - time.monotonic()) > 0:
             try:
                 message = process.messages.get(timeout=left)
             except queue.Empty:
                 break
-            if message["type"] in ("done", "failed", "cancelled", "exit"):
+            if message["type"] == "checkpoint":
+                uploader.offer(Snapshot(Path(message["path"]), message["files"]))
+            elif message["type"] in ("done", "failed", "cancelled", "exit"):
                 return
         self.close()
 

@@ -34,6 +34,11 @@ class WorkerSettings(BaseSettings):
     cancel_grace_s: float = Field(
         5.0, ge=0, description="A stage that was asked to stop is killed after so long."
     )
+    min_free_bytes: int = Field(
+        2**28,
+        ge=0,
+        description="A stage starts only where its inputs and so many bytes more fit on the disk.",
+    )
     transfers: int = Field(4, ge=1, le=64, description="Files moved at once by one slot.")
     prepare: bool = Field(
         True,

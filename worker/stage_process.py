@@ -4,7 +4,7 @@ It reads commands as JSON lines from stdin and writes messages as JSON lines to 
 own; what stages print to stdout and stderr are log lines.
 
     commands:  {"do": "run", "stage", "options", "root", "seed", "threads", "run_id"}
-               {"do": "cancel", "run_id"}
+               {"do": "stop", "run_id", "reason"}, reason "cancel", "lost" or "shutdown"
     messages:  {"type": "hello", "pid"} | {"type": "begun"}, the first of a run
                {"type": "progress", "fraction", "message", "eta_s"}
                {"type": "checkpoint", "path", "files": {name: [bytes, mtime_ns]}}
@@ -141,14 +141,14 @@ class Run:
     """One run of one stage."""
 
     def __init__(
-        self, command: dict[str, Any], messages: Messages, cancelled: set[str], registry: str
+        self, command: dict[str, Any], messages: Messages, stops: dict[str, str], registry: str
     ) -> None:
         self._registry = registry
         self._run_id: str = command["run_id"]
         self._stage_name: str = command["stage"]
         self._command = command
         self._messages = messages
-        self._cancelled = cancelled
+        self._stops = stops
         self._workspace = Workspace(Path(command["root"]))
         self._progress_at = 0.0
         self._snapshots = 0
@@ -191,7 +191,8 @@ class Run:
             seed=self._command["seed"],
             hooks=RunHooks(
                 on_progress=self._on_progress,
-                is_cancelled=lambda: self._run_id in self._cancelled,
+                is_cancelled=lambda: self._run_id in self._stops,
+                is_shutdown=lambda: self._stops.get(self._run_id) == "shutdown",
                 on_checkpoint=self._on_checkpoint,
             ),
         )
@@ -223,12 +224,12 @@ class Run:
         self._messages.send("checkpoint", path=str(target), files=files)
 
 
-def read_commands(commands: queue.Queue[dict[str, Any]], cancelled: set[str]) -> None:
+def read_commands(commands: queue.Queue[dict[str, Any]], stops: dict[str, str]) -> None:
     """Take commands from stdin; its end means that the worker is gone."""
     for line in sys.stdin:
         command = json.loads(line)
-        if command["do"] == "cancel":
-            cancelled.add(command["run_id"])
+        if command["do"] == "stop":
+            stops[command["run_id"]] = command["reason"]
         else:
             commands.put(command)
     kill_group()
@@ -272,14 +273,14 @@ def main() -> None:
     )
     messages = Messages(arguments.message_fd)
     commands: queue.Queue[dict[str, Any]] = queue.Queue()
-    cancelled: set[str] = set()
-    threading.Thread(target=read_commands, args=(commands, cancelled), daemon=True).start()
+    stops: dict[str, str] = {}  # by run, why it should end
+    threading.Thread(target=read_commands, args=(commands, stops), daemon=True).start()
     messages.send("hello", pid=os.getpid())
     pieces = preload_steps(arguments.registry, arguments.preload)
     while True:
         command = next_command(commands, pieces)
-        Run(command, messages, cancelled, arguments.registry).execute()
-        cancelled.discard(command["run_id"])
+        Run(command, messages, stops, arguments.registry).execute()
+        stops.pop(command["run_id"], None)
         tidy_memory()
 
 

@@ -233,6 +233,7 @@ def _fit(inputs: _Inputs, config: TrainConfig, ctx: StageContext, watcher: _Watc
         on_progress=watcher.on_progress,
         on_preview=watcher.on_preview,
         on_checkpoint=watcher.on_checkpoint,
+        wants_checkpoint=ctx.is_shutdown,
     )
 
 

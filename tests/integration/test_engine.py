@@ -258,8 +258,10 @@ def test_a_frozen_worker_loses_its_stage_to_another_in_the_same_home(
 
 def test_sigterm_gives_the_stage_back_without_counting_and_ends_in_seconds(engine: Engine) -> None:
     worker = engine.start_worker("w1")
-    job_id = engine.submit(SLOW)
-    engine.wait(lambda: engine.stage(job_id, "train").checkpoint_prefix)
+    plan = {"steps": 40, "step_s": 0.1, "save_at_shutdown": True}
+    job_id = engine.submit({"train": plan})
+    engine.wait(lambda: engine.stage(job_id, "train").progress > 0.2)
+    assert engine.stage(job_id, "train").checkpoint_prefix is None
     begun = time.monotonic()
     worker.terminate()
     worker.wait(20)

@@ -32,7 +32,7 @@ STAGES = (
     _stage("frames", ("ingest",), ("ingest",)),
     _stage("train", ("frames",), ("ingest", "frames"), needs_gpu=True),
     _stage("mesh", ("train",), ("ingest", "train"), time_limit_s=4.0),
-    _stage("video", ("train",), ("ingest", "train")),
+    _stage("video", ("train",), ("ingest", "train"), stall_s=1.5),
     _stage("report", ("mesh", "video"), ("ingest", "train", "mesh", "video")),
 )
 
@@ -61,6 +61,9 @@ def run(options: Any, ctx: StageContext) -> dict[str, Any]:
     for step in range(first + 1, steps + 1):
         time.sleep(plan.get("step_s", 0.0))
         print(f"{ctx.stage} step {step}")
+        if plan.get("save_at_shutdown") and ctx.is_shutdown():
+            state.write_text(json.dumps({"step": step}))
+            ctx.checkpoint_saved()
         ctx.progress(step / steps, f"step {step}", (steps - step) * plan.get("step_s", 0.0))
         if plan.get("save_every") and step % plan["save_every"] == 0:
             draft = ctx.checkpoint / "step.json.new"
@@ -90,6 +93,9 @@ def _misbehave(plan: dict[str, Any], ctx: StageContext, witness: Path) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
     if plan.get("fault"):
         raise ZeroDivisionError("/secret/path")
+    while earlier < plan.get("hang_times", 0):  # alive, and it says the same again and again
+        ctx.progress(0.1, "hanging")
+        time.sleep(0.1)
     if plan.get("deaf_s"):  # a native call that holds the interpreter: no Python thread runs
         ctypes.PyDLL(None).sleep(ctypes.c_uint(plan["deaf_s"]))
     if plan.get("spy"):

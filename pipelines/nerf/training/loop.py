@@ -78,6 +78,7 @@ def train(
     on_progress: Callable[[TrainProgress], None] = lambda progress: None,
     on_preview: Callable[[int, Model], None] = lambda step, model: None,
     on_checkpoint: Callable[[], None] = lambda: None,
+    wants_checkpoint: Callable[[], bool] = lambda: False,
 ) -> Model:
     """Fit a model; returned in `eval()` on the device it was trained on.
 
@@ -90,6 +91,7 @@ def train(
     on_progress: after each step on a CPU, every 20th on a GPU; may raise, which ends the run and
     leaves the last checkpoint as it was. on_preview: step and model in `eval()`, at the preview
     interval; its time does not count as training. on_checkpoint: a checkpoint is complete.
+    wants_checkpoint: asked before each report of progress; the state is saved where it says so.
     Raises NerfError: bad_config, bad_cameras, bad_checkpoint, too_few_images, non_finite_loss,
     bad_depth_maps, gpu_failed, gpu_lost.
     """
@@ -139,6 +141,9 @@ def train(
         step_rays.append(shape.num_rays)
         state.elapsed_s += step_times[-1]
         if losses is not None:
+            if wants_checkpoint():
+                save()
+                last_saved = time.monotonic()
             on_progress(_progress(state, config, losses, step_times, step_rays))
         if time.monotonic() - last_saved >= config.checkpoint_seconds:
             save()

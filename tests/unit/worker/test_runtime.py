@@ -9,6 +9,7 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -24,6 +25,7 @@ from storage.models import StageRow
 from storage.records import live_workers, register_worker
 from tests.integration.engine import Engine, is_running
 from worker.__main__ import MANY_CORES, default_slots, parse_arguments
+from worker.runner import Pulse
 from worker.runtime import WorkerIdentity, WorkerRuntime
 from worker.settings import WorkerSettings
 
@@ -223,3 +225,48 @@ def test_a_worker_whose_place_was_taken_while_it_slept_goes_on_under_another_id(
         engine.wait(lambda: workers_now() == {"w": "newer", mine: identity.boot}, 10)
     finally:
         runtime.close()
+
+
+@pytest.mark.parametrize(("times", "ends"), [(1, "succeeded"), (2, "failed")])
+def test_a_stage_that_hangs_is_ended_once_and_then_fails_the_job(
+    engine: Engine, times: int, ends: str
+) -> None:
+    """It is alive and reports, always the same."""
+    job = engine.submit({"video": {"hang_times": times}}, ring=False)
+    with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
+        assert engine.wait_for(job, "succeeded", "failed").state == ends
+    outcomes = engine.outcomes(job, "video")
+    assert outcomes == ["stalled", "succeeded" if times == 1 else "stalled"]
+    error = engine.job(job).error
+    assert (error or {}).get("code") == (None if times == 1 else "stalled")
+
+
+def test_silence_counts_only_while_somebody_watches() -> None:
+    pulse = Pulse()
+    begun = time.monotonic()
+    for second in range(10):
+        pulse.silent_s(begun + second / 2)
+    assert pulse.silent_s(begun + 5) == pytest.approx(5.0, abs=0.1)
+    assert pulse.silent_s(begun + 5000) == pytest.approx(6.0, abs=0.1)  # it was frozen
+    pulse.notice({"type": "progress", "fraction": 0.5, "message": "half"})
+    assert pulse.silent_s(begun + 5000) == 0.0
+    pulse.silent_s(begun + 5001)
+    pulse.notice({"type": "progress", "fraction": 0.5, "message": "half"})
+    assert pulse.silent_s(begun + 5001) == 1.0
+    pulse.notice({"type": "checkpoint"})
+    assert pulse.silent_s(begun + 5001) == 0.0
+
+
+def test_a_stage_does_not_begin_on_a_disk_without_room(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is fetched; the job waits for its next try, and the error says how much is needed."""
+    monkeypatch.setenv("NERFWORKS_WORKER_MIN_FREE_BYTES", str(2**60))
+    job = engine.submit({}, ring=False)
+    with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
+        engine.wait(lambda: engine.stage(job, "ingest").error, 20)
+    error = engine.stage(job, "ingest").error
+    assert error is not None
+    assert error["code"] == "disk_full"
+    assert "needs 1073741824.0" in error["message"]
+    assert not engine.notes("ingest start")

@@ -10,7 +10,7 @@ from PIL import Image
 
 from pipelines.errors import Cancelled, TrainingError
 from pipelines.manifest import RunHooks
-from pipelines.nerf.training.checkpoint import load_model
+from pipelines.nerf.training.checkpoint import load_checkpoint, load_model
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.workspace import Workspace
@@ -80,6 +80,32 @@ def test_a_cancel_ends_training_at_the_next_step(tmp_path: Path) -> None:
     assert messages[-1].startswith("step 3/400, ")
     assert messages[-1].endswith(" dB")
     assert not workspace.stage("train").exists()
+
+
+def test_a_worker_that_shuts_down_leaves_a_checkpoint_of_the_step_that_it_stopped_at(
+    tmp_path: Path,
+) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=8)
+    messages: list[str] = []
+    saved: list[int] = []
+
+    def stops() -> bool:
+        return any(message.startswith("step 2/") for message in messages)
+
+    def on_checkpoint() -> None:
+        kept = workspace.checkpoint("train") / "training.pt"
+        saved.append(int(load_checkpoint(kept)["step"]))
+
+    hooks = RunHooks(
+        on_progress=lambda fraction, message, eta_s: messages.append(message),
+        is_cancelled=stops,
+        is_shutdown=stops,
+        on_checkpoint=on_checkpoint,
+    )
+    with pytest.raises(Cancelled):
+        tiny_job.run_with(workspace, "train", hooks)
+    assert messages[-1].startswith("step 2/400, ")
+    assert saved == [3]
 
 
 def test_a_lost_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
