@@ -12,6 +12,7 @@ from typing import Any
 
 from fastapi import Depends, FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi.responses import HTMLResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
@@ -20,6 +21,7 @@ from api.artifacts import endpoints as artifacts
 from api.captures import endpoints as captures
 from api.captures.receiving import sweep
 from api.deps import MAX_STORE_CALLS, Services, require_key
+from api.documentation import page_of
 from api.jobs import endpoints as jobs
 from api.probes import Probe
 from api.problems import Problem
@@ -33,6 +35,7 @@ from storage.schema import upgrade
 
 VERSION = "1"
 DRAIN_S = 2.0
+PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 logger = logging.getLogger("nerfworks.api")
 
 
@@ -117,6 +120,8 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
         lifespan=_lifespan,
         generate_unique_id_function=_operation_id,
         redirect_slashes=False,
+        docs_url=None,  # those pages load scripts from elsewhere: ours is api.documentation
+        redoc_url=None,
     )
     app.state.settings = settings
     keyed = (captures.router, jobs.router, artifacts.router, catalogue.router)
@@ -132,5 +137,13 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
         app.include_router(router, dependencies=[Depends(require_key)])
     for router in others:
         app.include_router(router)
+
+    @app.get("/docs", include_in_schema=False, response_class=HTMLResponse)
+    def get_documentation() -> HTMLResponse:
+        """The OpenAPI document as a page."""
+        return HTMLResponse(
+            page_of(app.openapi()), headers={"Content-Security-Policy": PAGE_POLICY}
+        )
+
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     return app

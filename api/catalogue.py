@@ -30,7 +30,7 @@ _PAGE = """<!doctype html>
 <h1>nerfworks</h1>
 <p>Send a phone capture over HTTP; get back a mesh, a point cloud and a video.</p>
 <ul>
-<li><a href="/docs">Interactive documentation</a>, <a href="/openapi.json">OpenAPI</a></li>
+<li><a href="/docs">Documentation</a>, <a href="/openapi.json">OpenAPI</a></li>
 <li><a href="/livez">/livez</a>, <a href="/readyz">/readyz</a></li>
 </ul>
 <pre>curl -H "Authorization: Bearer KEY" -F file=@walk.mp4 URL/v1/captures

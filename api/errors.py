@@ -26,6 +26,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from api.codes import CODES, COMMON
 from api.methods import HeadOfGet, allowed_methods
 from api.problems import (
     ApiError,
@@ -78,18 +79,25 @@ _FRAMEWORK_HINTS = {
 }
 
 
-def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's `responses` for these error statuses, and for those that any call may give.
+def responses(*which: int | str) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's `responses` for these errors, and for those that any call may give.
 
-    `api.app` adds the schema `Problem` that they refer to.
+    which: codes (`api.codes`), or a status alone. `api.app` adds the schema `Problem` that they
+    refer to.
     """
-    return {
-        status: {
-            "content": {PROBLEM_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-            "description": HTTPStatus(status).phrase,
-        }
-        for status in sorted({401, 422, 500, 503, *statuses})
-    }
+    codes = [code for code in (*COMMON, *which) if isinstance(code, str)]
+    statuses = {one for one in which if isinstance(one, int)} | {CODES[code] for code in codes}
+    return {status: _documented(status, codes) for status in sorted(statuses)}
+
+
+def _documented(status: int, codes: list[str]) -> dict[str, Any]:
+    schema: dict[str, Any] = {"$ref": "#/components/schemas/Problem"}
+    mine = sorted({code for code in codes if CODES[code] == status})
+    phrase = HTTPStatus(status).phrase
+    if mine:
+        schema = {"allOf": [schema, {"properties": {"code": {"enum": mine}}}]}
+        phrase = f"{phrase}: {', '.join(mine)}"
+    return {"content": {PROBLEM_TYPE: {"schema": schema}}, "description": phrase}
 
 
 class _ProblemResponse(JSONResponse):

@@ -34,7 +34,7 @@ async def get_liveness(response: Response) -> Liveness:
     return Liveness()
 
 
-@router.get("/readyz", responses=responses(503))
+@router.get("/readyz", responses=responses("not_ready"))
 async def get_readiness(services: ServicesDep, response: Response) -> Readiness:
     """Whether database, broker and object store answer, each within its time."""
     response.headers["Cache-Control"] = "no-store"

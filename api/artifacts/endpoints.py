@@ -10,6 +10,7 @@ from starlette.responses import RedirectResponse, Response
 from api.artifacts import service
 from api.artifacts.content import content_response
 from api.artifacts.schemas import ArtifactList
+from api.codes import BYTES
 from api.deps import ServicesDep
 from api.errors import responses
 from api.ids import JobId
@@ -28,7 +29,7 @@ _CONTENT: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get("", responses=responses(404))
+@router.get("", responses=responses("job_not_found"))
 def list_artifacts(job_id: JobId, services: ServicesDep, request: Request) -> ArtifactList:
     """What the job offers for download."""
     with services.database.read_scope() as session:
@@ -41,7 +42,7 @@ def list_artifacts(job_id: JobId, services: ServicesDep, request: Request) -> Ar
     "/{name}",
     response_class=Response,
     responses={
-        **responses(404, 416),
+        **responses("job_not_found", "artifact_not_found", *BYTES),
         **_CONTENT,
         307: {"description": "The bytes are at this signed URL."},
     },
@@ -72,7 +73,7 @@ def download_artifact(
 
 @signed_router.head("/{token}", include_in_schema=False)
 @signed_router.get(
-    "/{token}", response_class=Response, responses={**responses(403, 404, 416), **_CONTENT}
+    "/{token}", response_class=Response, responses={**responses("url_invalid", *BYTES), **_CONTENT}
 )
 def download_object(token: str, services: ServicesDep, request: Request) -> Response:
     """A signed, expiring URL of the local object store: needs no key."""

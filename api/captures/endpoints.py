@@ -12,6 +12,7 @@ from starlette.requests import ClientDisconnect
 from api.captures import service
 from api.captures.receiving import Body, Limits, receive, staging_file
 from api.captures.schemas import CapturePage, CaptureView
+from api.codes import CAPTURE, ONCE, UPLOAD
 from api.deps import CallerDep, ServicesDep
 from api.errors import responses
 from api.idempotency import IdempotencyKey, Once
@@ -23,6 +24,12 @@ PATH = "/v1/captures"
 CLIENT_WENT_AWAY = 499
 router = APIRouter(prefix=PATH, tags=["captures"])
 
+MADE = "$response.body#/id"
+LINKS = {
+    "get_capture": {"operationId": "get_capture", "parameters": {"capture_id": MADE}},
+    "delete_capture": {"operationId": "delete_capture", "parameters": {"capture_id": MADE}},
+    "create_job": {"operationId": "create_job", "requestBody": {"capture_id": MADE}},
+}
 _UPLOAD_SCHEMA = {
     "requestBody": {
         "required": True,
@@ -42,7 +49,7 @@ _UPLOAD_SCHEMA = {
 @router.post(
     "",
     status_code=201,
-    responses=responses(408, 409, 413, 415, 507),
+    responses={**responses(*UPLOAD, *CAPTURE, *ONCE), 201: {"links": LINKS}},
     openapi_extra=_UPLOAD_SCHEMA,
     response_model=CaptureView,
 )
@@ -78,7 +85,7 @@ async def create_capture(
         return await asyncio.to_thread(service.keep, services, received, once)
 
 
-@router.get("", responses=responses())
+@router.get("", responses=responses("cursor_invalid"))
 def list_captures(
     services: ServicesDep,
     limit: Annotated[int, Query(ge=1, le=100)] = 50,
@@ -90,14 +97,16 @@ def list_captures(
         return CapturePage(items=[CaptureView.of(one) for one in found], next_cursor=following)
 
 
-@router.get("/{capture_id}", responses=responses(404))
+@router.get("/{capture_id}", responses=responses("capture_not_found"))
 def get_capture(capture_id: CaptureId, services: ServicesDep) -> CaptureView:
     """One capture."""
     with services.database.read_scope() as session:
         return CaptureView.of(records.get_capture(session, capture_id))
 
 
-@router.delete("/{capture_id}", status_code=204, responses=responses(404, 409))
+@router.delete(
+    "/{capture_id}", status_code=204, responses=responses("capture_not_found", "conflict")
+)
 def delete_capture(capture_id: CaptureId, services: ServicesDep) -> None:
     """Delete a capture and its bytes. Finished jobs keep their results."""
     service.delete(services, capture_id)

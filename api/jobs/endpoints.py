@@ -6,6 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Body, Query, Request, Response
 
+from api.codes import BODY, ONCE, RETRY
 from api.deps import CallerDep, ServicesDep
 from api.errors import responses
 from api.idempotency import IdempotencyKey, Once
@@ -29,6 +30,13 @@ from storage import queries, records
 from storage.states import JOB_TERMINAL
 
 POLL_S = "1"
+LINKS = {
+    name: {"operationId": name, "parameters": {"job_id": "$response.body#/id"}}
+    for name in (
+        *("get_job", "cancel_job", "retry_job", "list_job_events", "get_job_logs"),
+        *("list_artifacts", "delete_job"),
+    )
+}
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 
@@ -38,7 +46,15 @@ def _hint_poll(response: Response, job: JobView) -> None:
         response.headers["Retry-After"] = POLL_S
 
 
-@router.post("", status_code=202, responses=responses(404, 409), response_model=JobView)
+@router.post(
+    "",
+    status_code=202,
+    responses={
+        **responses("capture_not_found", "preset_unknown", "options_invalid", *BODY, *ONCE),
+        202: {"links": LINKS},
+    },
+    response_model=JobView,
+)
 def create_job(
     wanted: JobRequest,
     services: ServicesDep,
@@ -53,13 +69,13 @@ def create_job(
     return answer
 
 
-@router.post(":validate", responses=responses())
+@router.post(":validate", responses=responses("preset_unknown", "options_invalid", *BODY))
 def validate_job(wanted: JobWish, services: ServicesDep) -> JobPlan:
     """Check preset, options and labels before a capture is uploaded. Creates nothing."""
     return service.plan(services, wanted)
 
 
-@router.get("", responses=responses())
+@router.get("", responses=responses("cursor_invalid"))
 def list_jobs(
     services: ServicesDep,
     state: Annotated[JobState | None, Query()] = None,
@@ -75,7 +91,7 @@ def list_jobs(
         return JobPage(items=[JobSummary.of(job) for job in found], next_cursor=following)
 
 
-@router.get("/{job_id}", responses=responses(404))
+@router.get("/{job_id}", responses=responses("job_not_found"))
 def get_job(job_id: JobId, services: ServicesDep, request: Request, response: Response) -> JobView:
     """One job: state, stages with progress and time left, metrics, error, artifacts."""
     with services.database.read_scope() as session:
@@ -84,7 +100,9 @@ def get_job(job_id: JobId, services: ServicesDep, request: Request, response: Re
     return job
 
 
-@router.post("/{job_id}/cancel", status_code=202, responses=responses(404, 409))
+@router.post(
+    "/{job_id}/cancel", status_code=202, responses=responses("job_not_found", "job_finished")
+)
 def cancel_job(
     job_id: JobId,
     services: ServicesDep,
@@ -101,7 +119,10 @@ def cancel_job(
 
 
 @router.post(
-    "/{job_id}/retry", status_code=202, responses=responses(404, 409), response_model=JobView
+    "/{job_id}/retry",
+    status_code=202,
+    responses=responses(*RETRY, *BODY, *ONCE),
+    response_model=JobView,
 )
 def retry_job(
     job_id: JobId,
@@ -123,7 +144,7 @@ def retry_job(
     return answer
 
 
-@router.get("/{job_id}/events", responses=responses(404))
+@router.get("/{job_id}/events", responses=responses("job_not_found"))
 def list_job_events(
     job_id: JobId,
     services: ServicesDep,
@@ -138,13 +159,13 @@ def list_job_events(
     return EventPage(items=items, next=items[-1].seq if len(found) > limit else None)
 
 
-@router.delete("/{job_id}", status_code=204, responses=responses(404, 409))
+@router.delete("/{job_id}", status_code=204, responses=responses("job_not_found", "conflict"))
 def delete_job(job_id: JobId, services: ServicesDep) -> None:
     """Delete a job and its bytes."""
     service.delete(services, job_id)
 
 
-@router.get("/{job_id}/logs", responses=responses(404))
+@router.get("/{job_id}/logs", responses=responses("job_not_found"))
 def get_job_logs(
     job_id: JobId,
     services: ServicesDep,

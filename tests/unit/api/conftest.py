@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -228,6 +230,26 @@ def live(tmp_path: Path) -> Iterator[LiveServer]:
     server.stop()
 
 
+@cache
+def documented() -> dict[str, Any]:
+    """The OpenAPI document."""
+    return create_app(ApiSettings()).openapi()
+
+
+def check_documented(method: str, path: str, status: int, code: str) -> None:
+    """Assert that OpenAPI names this code among the answers of this call."""
+    for template, calls in documented()["paths"].items():
+        pattern = re.sub(r"\{[^}]*\}", "[^/]+", template)
+        call = calls.get(method.lower().replace("head", "get"))
+        if call is not None and re.fullmatch(pattern, path):
+            answers = call["responses"]
+            assert str(status) in answers, f"{method} {template} may not answer {status}"
+            schema = answers[str(status)]["content"]["application/problem+json"]["schema"]
+            listed = schema["allOf"][1]["properties"]["code"]["enum"] if "allOf" in schema else []
+            assert code in listed, f"{method} {template} says nothing of {code}"
+            return
+
+
 def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
     """Assert that the answer is the one shape of an error; returns it."""
     assert answer.status_code == status, answer.text
@@ -244,4 +266,5 @@ def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
     assert found["hint"]
     assert found["instance"] == answer.request.url.path
     assert "Traceback" not in answer.text
+    check_documented(answer.request.method, answer.request.url.path, status, code)
     return found

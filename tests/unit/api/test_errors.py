@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from fastapi import FastAPI
 from sqlalchemy.exc import OperationalError
 
 from api.app import create_app
+from api.codes import CODES
 from api.errors import to_api_error
 from api.problems import ApiError
 from pipelines import errors as pipeline_errors
@@ -31,6 +33,8 @@ V1_CALLS = [
     ("GET", "/v1/jobs"),
     ("GET", "/v1/jobs/x"),
     ("POST", "/v1/jobs/x/cancel"),
+    ("POST", "/v1/jobs/x/retry"),
+    ("GET", "/v1/jobs/x/events"),
     ("DELETE", "/v1/jobs/x"),
     ("GET", "/v1/jobs/x/artifacts"),
     ("GET", "/v1/jobs/x/artifacts/y"),
@@ -266,7 +270,7 @@ def test_openapi_names_operations_and_the_shape_of_errors(service: Service) -> N
             "get_job",
             "cancel_job",
             "delete_job",
-            "get_job_logs",
+            *("get_job_logs", "retry_job", "list_job_events"),
         ),
         *("list_artifacts", "download_artifact", "download_object"),
         *("list_presets", "get_options_schema", "get_liveness", "get_readiness"),
@@ -277,6 +281,48 @@ def test_openapi_names_operations_and_the_shape_of_errors(service: Service) -> N
             for status, answer in call["responses"].items():
                 if int(status) >= 400:
                     assert list(answer["content"]) == ["application/problem+json"], path
+
+
+def test_every_code_in_the_sources_is_listed_with_its_status() -> None:
+    """Codes are written as `code="..."`; those of captures are raised by what the API imports."""
+    root = Path(__file__).resolve().parents[3]
+    sources = [
+        *(path for path in (root / "api").rglob("*.py") if "client" not in path.parts),
+        root / "pipelines/captures/sniff.py",
+        root / "pipelines/captures/archive_rules.py",
+        root / "pipelines/captures/parsing.py",
+    ]
+    found = {
+        code
+        for path in sources
+        for code in re.findall(r'\bcode\s*=\s*"([a-z_]+)"', path.read_text("utf-8"))
+    }
+    assert len(found) > 25
+    assert found <= set(CODES)
+    assert {CODES[kind.code] == kind.status for kind in ApiError.__subclasses__()} == {True}
+
+
+def test_links_lead_to_calls_that_there_are(service: Service) -> None:
+    document = service.anyone.get("/openapi.json").json()
+    calls = [call for calls in document["paths"].values() for call in calls.values()]
+    names = {call["operationId"] for call in calls}
+    links = [
+        link["operationId"]
+        for call in calls
+        for answer in call["responses"].values()
+        for link in answer.get("links", {}).values()
+    ]
+    assert {"get_job", "create_job", "list_artifacts"} <= set(links) <= names
+
+
+def test_the_documentation_loads_nothing_from_elsewhere(service: Service) -> None:
+    answer = service.anyone.get("/docs")
+    assert answer.status_code == 200
+    assert not re.search(r"<script|<link|https?://|@import|url\(", answer.text)
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    for text in ("POST /v1/jobs", "idempotency_key_reused", "Idempotency-Key", "curl"):
+        assert text in answer.text
+    assert "{&#x27;" not in answer.text, "a Python object was printed"
 
 
 def test_front_page_links_the_documentation(service: Service) -> None:
