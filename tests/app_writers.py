@@ -215,9 +215,14 @@ def write_rgbd_list(path: Path, num: int = 11, width: int = 240) -> CamerasFile:
 
 
 def write_llff(
-    path: Path, num: int = 11, width: int = 240, shift: int = 0, as_text: bool = True
+    path: Path,
+    num: int = 11,
+    width: int = 240,
+    shift: int = 0,
+    as_text: bool = True,
+    padded: bool = False,
 ) -> CamerasFile:
-    """`poses_bounds.npy` and pictures of twice the stated size, their names not padded.
+    """`poses_bounds.npy` for pictures of twice the size. padded: whether names have leading zeros.
 
     as_text: rows follow the names as text, as the format's own program writes them; else they
     follow the numbers. shift: rows that are this many pictures late, as where a picture was added.
@@ -226,7 +231,8 @@ def write_llff(
     focal = 0.8 * width
     lens = Intrinsics(width, height, focal, focal, width / 2, height / 2)
     truth = replace(walk(num, lens), metric=False)
-    names = {index: f"kitchen/images/IMG_7_{index}.jpg" for index in range(num)}
+    digits = 3 if padded else 1
+    names = {index: f"kitchen/images/IMG_7_{index:0{digits}}.jpg" for index in range(num)}
     rows = {}
     for index, image in enumerate(truth.images):
         pose = pose_matrix(image)

@@ -120,9 +120,11 @@ def _contradicted(readings: Sequence[Reading], off: Sequence[float]) -> CaptureE
         f"{reading.rule}: {100 * distance:.2f} %"
         for reading, distance in zip(readings, off, strict=True)
     )
+    several = min(off) <= MOST_OFF
+    fit = "fit the pictures in several ways" if several else "do not fit the pictures"
     return CaptureError(
-        "The poses do not fit the pictures: places that are the same in two pictures lie beside "
-        f"the line where the poses have them, by this share of the picture's diagonal: {told}.",
+        f"The poses {fit}: places that are the same in two pictures lie beside the line where the "
+        f"poses have them, by this share of the picture's diagonal: {told}.",
         code="poses_malformed",
         hint="Check that no picture was added, removed or renamed since the poses were written, or "
         "send the pictures alone to have their poses found.",

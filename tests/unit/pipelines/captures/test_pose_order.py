@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from pipelines.captures.archive_rules import ArchiveLimits
+from pipelines.captures.contents import Reading
+from pipelines.captures.importer import Claim
+from pipelines.captures.importers import llff
 from pipelines.captures.orders import AS_TEXT, COUNTED, FROM_0, FROM_1, frame_number, orders
-from pipelines.captures.pose_order import epipolar_distances
+from pipelines.captures.pose_order import epipolar_distances, proven
+from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
+from pipelines.options import IngestOptions
 from pipelines.sample.film import hand_held_pose, phone_camera
 from pipelines.scene.cameras_file import Intrinsics
+from tests.app_writers import write_llff
+from tests.unit.pipelines.captures.archives import context
 
 LENS = phone_camera(480)
 WIDE = Intrinsics(400, 300, 250.0, 255.0, 190.0, 160.0)
@@ -36,6 +48,30 @@ def test_points_lie_on_their_lines_and_pixels_beside_them_as_far_as_they_are_mov
     # The other way round it is the same.
     turned = epipolar_distances(poses[::-1], (WIDE, LENS), (moved, places[0]))
     np.testing.assert_allclose(turned, off, rtol=1e-9)
+
+
+def test_two_readings_that_fit_alike_are_refused(tmp_path: Path) -> None:
+    """Nearly the same poses under both: the pictures cannot tell, and nobody guesses."""
+    write_llff(tmp_path / "c.zip", padded=True)
+    with CaptureArchive(tmp_path / "c.zip", ArchiveLimits()) as archive:
+        capture = llff.read(archive, Claim("kitchen/", ""))
+        (true,) = capture.readings
+        moved = [
+            replace(
+                source,
+                world_from_camera=tuple(
+                    (*row[:3], row[3] + 1e-4 * n) for row in source.world_from_camera
+                ),
+            )
+            for n, source in enumerate(true.sources)
+        ]
+        both = replace(capture, readings=[true, Reading("another way", moved, False)])
+        with pytest.raises(CaptureError, match=r"in several ways: .*another way: 0") as caught:
+            proven(archive, both, IngestOptions(), context(tmp_path / "both"))
+        assert caught.value.code == "poses_malformed"
+        alone = proven(archive, capture, IngestOptions(), context(tmp_path / "alone"))
+    assert alone.sources == true.sources
+    assert alone.warnings == capture.warnings
 
 
 def test_cameras_in_one_place_have_no_lines() -> None:

@@ -45,11 +45,12 @@ def test_a_plain_order_that_pictures_cannot_confirm_is_taken_and_told(tmp_path: 
     assert warning_with(summary, "Too few of the pictures match")
 
 
-def test_rows_one_picture_late_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("padded", [False, True])
+def test_rows_one_picture_late_are_refused(tmp_path: Path, padded: bool) -> None:
     """As many rows as pictures, but a picture was added and another taken away."""
     ctx = context(tmp_path)
     ctx.workspace.capture_file.parent.mkdir(parents=True)
-    write_llff(ctx.workspace.capture_file, shift=1)
+    write_llff(ctx.workspace.capture_file, shift=1, padded=padded)
     with pytest.raises(Exception, match="do not fit the pictures") as caught:
         run(IngestOptions(), ctx)
     assert getattr(caught.value, "code", "") == "poses_malformed"
