@@ -5,6 +5,7 @@ For every format that names its pictures. Standard library only.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from pipelines.captures.named_files import NamedFiles, folder_of
 from pipelines.captures.parsing import missing, some_of
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
+
+_SUFFIX = re.compile(r"\.(jpe?g|png|webp|tiff?|heic|heif|dng|cr[23]|nef|arw|raf|rw2|orf)$", re.I)
 
 
 @dataclass(frozen=True)
@@ -36,12 +39,23 @@ def match_pictures(
     """
     files = NamedFiles(archive.images, folder_of(archive.images, paths, near))
     exact, loose = files.find(paths)
+    loose |= _of_another_format(files, [path for path in paths if path not in exact | loose])
+    loose = {path: name for path, name in loose.items() if name not in exact.values()}
     found = exact | loose
     if not found:
         raise none_there(file, paths)
     absent = [path for path in dict.fromkeys(paths) if path not in found]
     archive.set_aside(archive.images - set(found.values()), f"not listed in {file}")
     return Matched(found, absent, listing_warnings(file, paths, absent, loose))
+
+
+def _of_another_format(files: NamedFiles, paths: Sequence[str]) -> dict[str, str]:
+    """Pictures that were developed or converted since: of the same name but for its suffix."""
+    stems = {path: _SUFFIX.sub("", path) for path in paths}
+    exact, loose = files.find(stem for path, stem in stems.items() if stem != path)
+    found = {path: (exact | loose)[stem] for path, stem in stems.items() if stem in exact | loose}
+    count = Counter(found.values())
+    return {path: name for path, name in found.items() if count[name] == 1}
 
 
 def none_there(file: str, paths: Sequence[str]) -> CaptureError:

@@ -305,3 +305,18 @@ def test_one_bad_camera_in_ten_is_left_out_by_name(tmp_path: Path) -> None:
     summary, ctx = ingest(tmp_path, PICTURES | {"cameras.xml": text.encode()})
     assert len(cameras(ctx).images) == 9
     assert "IMG_9.jpg" in warning_with(summary, "Left out")
+
+
+def test_photos_that_were_developed_since_are_found_and_told(tmp_path: Path) -> None:
+    """Aligned as raw files, sent as JPEG; one label fits two pictures, and is left out."""
+    labels = [f"{image.file.rpartition('/')[2][:-4]}.CR2" for image in TRUTH.images]
+    files = PICTURES | {"cameras.xml": metashape_xml(TRUTH, labels=labels).encode()}
+    summary, ctx = ingest(tmp_path / "a", files)
+    assert_poses(ctx, TRUTH)
+    assert "IMG_10.CR2" in warning_with(summary, "10 paths", "matched by the end of the name")
+    labels[1] = "IMG_9.TIF"
+    files = PICTURES | {"cameras.xml": metashape_xml(TRUTH, labels=labels).encode()}
+    summary, ctx = ingest(tmp_path / "b", files)
+    assert len(cameras(ctx).images) == 8
+    assert_poses(ctx, TRUTH)
+    assert warning_with(summary, "2 of them are not in the archive", "IMG_9.CR2, IMG_9.TIF")
