@@ -321,7 +321,7 @@ def run_job_locally(
     Returns the manifests by stage. Raises OptionsError, KeyError (preset), and what stages raise.
     """
     options = resolve_options(preset, dict(overrides))
-    skipped = stages_skipped(preset, kind)
+    skipped = stages_skipped(preset, kind, overrides)
     manifests: dict[str, dict[str, Any]] = {}
     for stage in STAGES:
         values = options[stage.name]

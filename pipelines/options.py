@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import types
+from collections.abc import Collection
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError
@@ -354,12 +355,16 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
 )
 
 
-def stages_skipped(preset: str, kind: str) -> frozenset[str]:
-    """The stages that a job skips: for its preset, and for its kind of capture.
+ON_REQUEST = frozenset(export.kind for export in EXPORTS if export.on_request)
+"""Exports that a job makes only where it has options for them, be they the defaults."""
 
-    Raises KeyError for an unknown preset or kind.
+
+def stages_skipped(preset: str, kind: str, asked: Collection[str] = ()) -> frozenset[str]:
+    """The stages that a job skips: for its preset, its kind of capture, and unless asked for.
+
+    asked: stages that the job has options for. Raises KeyError for an unknown preset or kind.
     """
-    return PRESETS[preset].without | skipped_stages(kind)
+    return PRESETS[preset].without | (ON_REQUEST - set(asked)) | skipped_stages(kind)
 
 
 class OptionsError(ValueError):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from fastapi import Request
 from sqlalchemy.orm import Session
 from starlette.responses import Response
@@ -44,9 +46,9 @@ def choose_preset(session: Session, asked: str | None) -> tuple[str, str]:
     return asked, "asked for"
 
 
-def stage_seeds(preset: str, kind: str) -> list[StageSeed]:
-    """The stages of a job with this preset on a capture of this kind."""
-    skipped = stages_skipped(preset, kind)
+def stage_seeds(preset: str, kind: str, asked: Collection[str]) -> list[StageSeed]:
+    """The stages of a job with this preset on a capture of this kind. asked: with options."""
+    skipped = stages_skipped(preset, kind, asked)
     return [
         StageSeed(stage.name, stage.after, stage.needs_gpu, stage.name in skipped)
         for stage in STAGES
@@ -86,7 +88,7 @@ def create(services: Services, wanted: JobRequest, once: Once, request: Request)
             preset=preset,
             preset_reason=reason,
             options=resolve_options(preset, wanted.options),
-            stages=stage_seeds(preset, kind),
+            stages=stage_seeds(preset, kind, wanted.options),
             labels=wanted.labels,
         )
         ready.extend(jobs.ready_stage_ids(job))

@@ -15,6 +15,7 @@ KINDS = (
     "video",
     "cameras",
     "dataset",
+    "views",
 )
 """In the order in which they are listed and, where nothing runs side by side, made."""
 

@@ -29,6 +29,7 @@ class Export:
     version: raised when the same scene and options give another result.
     run: see `ExportFunction`. options: their class; `RenderingOptions` where it renders.
     artifacts: what it writes; one that a scene has no use for may be missing.
+    on_request: whether jobs skip it unless they have options for it.
     reads: stages whose folders it reads besides that of `train`.
     needs_gpu, time_limit_s: as in `pipelines.stage.Stage`.
     """
@@ -39,5 +40,6 @@ class Export:
     options: type[StageOptions]
     artifacts: tuple[Artifact, ...]
     reads: tuple[str, ...] = ()
+    on_request: bool = False
     needs_gpu: bool = True
     time_limit_s: float = 6 * 3600.0

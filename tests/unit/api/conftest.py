@@ -25,6 +25,7 @@ from api.app import create_app
 from api.deps import Services
 from api.settings import ApiSettings
 from pipelines.manifest import fingerprint
+from pipelines.options import ON_REQUEST
 from pipelines.registry import STAGES, get_stage
 from storage.claims import claim_stage
 from storage.jobs import stage_id
@@ -151,8 +152,8 @@ def made_from(job: Job, name: str, entries: list[dict[str, Any]]) -> dict[str, A
     }
 
 
-NUM_ARTIFACTS = sum(len(stage.artifacts) for stage in STAGES)
-"""What a finished job has."""
+NUM_ARTIFACTS = sum(len(stage.artifacts) for stage in STAGES if stage.name not in ON_REQUEST)
+"""What a finished job has that asked for no export on request."""
 
 
 def finish_job(services: Services, job_id: str, content_of: Callable[[str], bytes]) -> None:

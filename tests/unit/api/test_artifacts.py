@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from api.artifacts.ranges import parse_range, tag_listed
 from api.problems import BadRangeError
+from pipelines.options import ON_REQUEST
 from pipelines.registry import STAGES
 from storage.claims import claim_stage
 from storage.jobs import stage_id
@@ -48,7 +49,8 @@ def get(
 def test_list_names_every_artifact_of_the_registry(done: tuple[Service, str]) -> None:
     service, path = done
     items = service.http.get(path).json()["items"]
-    declared = [artifact for stage in STAGES for artifact in stage.artifacts]
+    made = [stage for stage in STAGES if stage.name not in ON_REQUEST]
+    declared = [artifact for stage in made for artifact in stage.artifacts]
     assert [item["name"] for item in items] == [artifact.name for artifact in declared]
     for item, artifact in zip(items, declared, strict=True):
         assert set(item) == {"name", "media_type", "bytes", "sha256", "url", "opens_with"}

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipelines.options import PRESETS, resolve_options
+from pipelines.options import ON_REQUEST, PRESETS, resolve_options
 from pipelines.registry import STAGE_NAMES, STAGES
 from storage.claims import Claim, claim_stage
 from storage.jobs import stage_id
@@ -92,7 +92,7 @@ def test_a_job_skips_what_its_preset_leaves_out_and_comes_to_its_end(
     service: Service, preset: str
 ) -> None:
     job = service.job(preset=preset)
-    skipped = PRESETS[preset].without | {"frames"}  # the capture is photos
+    skipped = PRESETS[preset].without | ON_REQUEST | {"frames"}  # the capture is photos
     assert {name for name, state in states(job).items() if state == "skipped"} == skipped
     finish_job(service.services, job["id"], lambda name: b"x")
     job = service.http.get(f"/v1/jobs/{job['id']}").json()
@@ -100,6 +100,20 @@ def test_a_job_skips_what_its_preset_leaves_out_and_comes_to_its_end(
     assert (job["metrics"] is None) == ("evaluate" in skipped)
     made = [art.name for one in STAGES if one.name not in skipped for art in one.artifacts]
     assert [item["name"] for item in job["artifacts"]] == made
+
+
+def test_a_job_makes_what_is_on_request_where_it_has_options_for_it(service: Service) -> None:
+    assert states(service.job())["views"] == "skipped"
+    assert states(service.job(options={"views": {}}))["views"] != "skipped"
+    answer = service.http.post(
+        "/v1/jobs",
+        json={
+            "capture_id": service.upload()["id"],
+            "preset": "draft",
+            "options": {"views": {"num_views": 3}},
+        },
+    )
+    assert "has no such stage" in answer.text, "a draft has nothing to render"
 
 
 def test_a_draft_has_its_mesh_and_says_why_there_is_no_other(service: Service) -> None:

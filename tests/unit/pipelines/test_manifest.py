@@ -23,7 +23,7 @@ from pipelines.manifest import (
     run_job_locally,
     run_stage,
 )
-from pipelines.options import PRESETS, stages_skipped
+from pipelines.options import ON_REQUEST, PRESETS, stages_skipped
 from pipelines.registry import STAGE_NAMES, STAGES, get_stage
 from pipelines.stage import Stage, StageContext
 from pipelines.workspace import Workspace
@@ -281,12 +281,19 @@ def test_a_job_runs_what_neither_capture_nor_preset_leave_out(
     assert list(manifests) == empty_stages
 
 
+def test_what_is_on_request_runs_where_it_has_options(
+    tmp_path: Path, empty_stages: list[str]
+) -> None:
+    run_job_locally(Workspace(tmp_path), "preview", {"views": {"num_views": 3}}, kind="video")
+    assert empty_stages == list(STAGE_NAMES)
+
+
 def test_another_preset_goes_on_from_what_it_shares_and_removes_what_it_skips(
     tmp_path: Path, empty_stages: list[str]
 ) -> None:
     workspace = Workspace(tmp_path)
     run_job_locally(workspace, "preview", {}, kind="video")
-    assert empty_stages == list(STAGE_NAMES)
+    assert empty_stages == [name for name in STAGE_NAMES if name not in ON_REQUEST]
     empty_stages.clear()
     run_job_locally(workspace, "draft", {}, kind="video")
     assert empty_stages == ["depth", "draft", "report"], "the same frames and poses"

@@ -73,6 +73,7 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
         "colmap.zip",
         "cameras.ply",
         "dataset.zip",
+        "views.zip",
     }
     mesh = next(item for item in report["artifacts"] if item["name"] == "mesh.glb")
     content = (job.stage("mesh") / "mesh.glb").read_bytes()

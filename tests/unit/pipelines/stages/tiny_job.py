@@ -41,6 +41,7 @@ OPTIONS: dict[str, Any] = {
     "mesh": {"resolution": 64, "num_views": 12, "render_long_side_px": 64, "max_faces": 3000},
     "pointcloud": {"num_points": 4000},
     "video": {"num_frames": 12, "long_side_px": 64},
+    "views": {"num_views": 3, "long_side_px": 64},
 }
 
 
