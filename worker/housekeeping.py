@@ -11,6 +11,7 @@ when several workers do it, because the database decides.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import logging
 import os
@@ -35,6 +36,7 @@ from storage.reconciling import sweep_orphans
 from worker.settings import WorkerSettings
 
 _log = logging.getLogger("nerfworks.worker")
+GONE = ".gone-"
 
 
 def detect_gpu() -> bool:
@@ -178,14 +180,28 @@ class Housekeeping:
             self._sweep_at = time.monotonic() + self._settings.sweep_s
             sweep_orphans(self._database, self._store)
 
+    def _clean_folders(self) -> None:
+        """Drop folders of jobs that are over.
+
+        Each is set aside in one step, right after the look at its job, and only then removed: a job
+        that is retried meanwhile begins with a folder of its own.
+        """
+        folders = list(self._work_dir.iterdir()) if self._work_dir.is_dir() else []
+        for folder in folders:
+            if folder.name.startswith(GONE):
+                shutil.rmtree(folder, ignore_errors=True)
+                continue
+            with self._database.read_scope() as session:
+                is_over = bool(finished_jobs(session, [folder.name]))
+            if is_over:
+                aside = folder.with_name(f"{GONE}{folder.name}-{secrets.token_hex(4)}")
+                with contextlib.suppress(OSError):  # another worker of this home was first
+                    folder.rename(aside)
+                shutil.rmtree(aside, ignore_errors=True)
+
     def clean(self) -> None:
         """Drop what finished jobs left on this machine, and bytes of deleted records."""
-        folders = list(self._work_dir.iterdir()) if self._work_dir.is_dir() else []
-        if folders:
-            with self._database.read_scope() as session:
-                over = finished_jobs(session, [folder.name for folder in folders])
-            for name in over:
-                shutil.rmtree(self._work_dir / name, ignore_errors=True)
+        self._clean_folders()
         with self._database.session_scope() as session:
             forget_old(session)
         drain_deletions(self._database, self._store)  # last: the store may hang

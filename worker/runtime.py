@@ -210,7 +210,7 @@ class WorkerRuntime:
         """
         while True:
             try:
-                with self._database.session_scope() as session:
+                with self._database.session_scope(f"worker:{self.identity.owner}") as session:
                     other = worker_seen_lately(session, self.identity.id)
                     if other is not None and is_alive(other):
                         self._rename()

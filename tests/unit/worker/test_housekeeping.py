@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -79,6 +80,39 @@ def test_folders_go_when_their_job_is_over_and_nothing_of_it_runs(tmp_path: Path
         cancel_stage(session, claim)
     keeper.clean()
     assert {path.name for path in work.iterdir()} == {live}
+
+
+def test_a_job_that_is_retried_while_its_old_folder_goes_keeps_its_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = make_database(tmp_path)
+    work = tmp_path / "work"
+    with database.session_scope() as session:
+        job = make_job(session).id
+        request_cancel(session, job)
+    (work / job / "train").mkdir(parents=True)
+    (work / ".gone-of-a-worker-that-died").mkdir()
+    remove = shutil.rmtree
+
+    def retried_meanwhile(folder: Path, ignore_errors: bool) -> None:
+        (work / job / "ingest").mkdir(parents=True, exist_ok=True)
+        remove(folder, ignore_errors=ignore_errors)
+
+    monkeypatch.setattr("worker.housekeeping.shutil.rmtree", retried_meanwhile)
+    keeper = Housekeeping(
+        database,
+        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
+        Bell(NO_BROKER, database),
+        WorkerSettings(),
+        work_dir=work,
+        register=lambda: None,
+        offer=lambda: None,
+    )
+    keeper._clean_folders()
+    assert [path.name for path in work.iterdir()] == [job]
+    assert (work / job / "ingest").is_dir()
+    assert not (work / job / "train").exists()
+    database.dispose()
 
 
 def test_the_loop_outlives_a_round_that_fails(tmp_path: Path) -> None:
