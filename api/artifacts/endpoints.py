@@ -21,7 +21,7 @@ from storage.signed_urls import verify_object_token
 router = APIRouter(prefix="/v1/jobs/{job_id}/artifacts", tags=["artifacts"])
 signed_router = APIRouter(prefix="/v1/objects", tags=["artifacts"])
 
-_BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+_BINARY = {"*/*": {"schema": {"type": "string", "format": "binary"}}}
 _CONTENT: dict[int | str, dict[str, Any]] = {
     200: {"description": "The bytes.", "content": _BINARY},
     206: {"description": "The range that was asked for.", "content": _BINARY},
