@@ -62,7 +62,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="depth",
-        version=2,
+        version=3,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.depth:run",

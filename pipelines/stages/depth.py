@@ -25,8 +25,9 @@ from pipelines.nerf.data.images import split_indices
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, config_from_dict
-from pipelines.nerf.stereo.maps import DepthMap, Progress, find_depth_maps
-from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_points, sensor_scale
+from pipelines.nerf.stereo.maps import DepthMap, Progress, find_depth_maps, surface_points
+from pipelines.nerf.stereo.planes import completed
+from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_scale
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.option_models import StageOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
@@ -37,7 +38,7 @@ from pipelines.scene.stereo_views import sensor_depth, stereo_view
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 
-_LOAD_SHARE, _STEREO_SHARE = 0.05, 0.95
+_LOAD_SHARE, _STEREO_SHARE, _PLANES_SHARE = 0.05, 0.83, 0.1
 _PICTURE_VIEWS = 6
 
 
@@ -70,9 +71,12 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         ctx.progress(_LOAD_SHARE * (index + 1) / len(images), "loading images")
 
     def on_progress(fraction: float, message: str) -> None:
-        share = _LOAD_SHARE + (_STEREO_SHARE - _LOAD_SHARE) * fraction
+        share = _LOAD_SHARE + _STEREO_SHARE * fraction
         spent = time.monotonic() - started
         ctx.progress(share, message, spent * (1.0 - share) / share if share > 0.1 else None)
+
+    def on_completing(fraction: float, message: str) -> None:
+        ctx.progress(_LOAD_SHARE + _STEREO_SHARE + _PLANES_SHARE * fraction, message)
 
     summary: dict[str, Any] = {"source": "stereo", "num_maps": len(images)}
     if with_sensor:
@@ -80,6 +84,9 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         summary |= told
     else:
         maps = find_depth_maps(views, config, _known_points(ctx), on_progress)
+    if config.complete_planes:
+        summary["matched_share"] = round(_known_share(maps), 4)
+        maps = completed(views, maps, config, on_completing)
     for image, view, found in zip(images, views, maps, strict=True):
         ctx.check_cancelled()
         writer.append(image.file, _pinhole(view), found)
@@ -106,7 +113,7 @@ def _with_sensor(
     if source == "sensor":
         return sensor_maps(views, sensed, config), told
     points = _known_points(ctx)
-    points = sensor_points(views, sensed) if points is None else points
+    points = surface_points(views, sensed) if points is None else points
     stereo = find_depth_maps(views, config, points, on_progress)
     scale = sensor_scale(stereo, sensed)
     if scale.factor != 1.0:
@@ -145,12 +152,16 @@ def _pinhole(view: StereoView) -> Pinhole:
     return Pinhole(width, height, *view.lens)
 
 
+def _known_share(maps: list[DepthMap]) -> float:
+    return float(np.mean([(found.z > 0).mean() for found in maps]))
+
+
 def _described(maps: list[DepthMap]) -> dict[str, Any]:
     """How much of the pictures has a depth, and how many neighbours agree with it."""
     shares = [float((found.z > 0).mean()) for found in maps]
     votes = [float(found.votes[found.z > 0].mean()) for found in maps if (found.z > 0).any()]
     return {
-        "known_share": round(float(np.mean(shares)), 4),
+        "known_share": round(_known_share(maps), 4),
         "least_known_share": round(float(np.min(shares)), 4),
         "mean_votes": round(float(np.mean(votes)), 2) if votes else None,
     }

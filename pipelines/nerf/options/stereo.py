@@ -43,3 +43,8 @@ class StereoConfig:
     agree_within: float = option(
         0.02, "Relative difference in depth up to which two views agree.", ge=1e-4, le=0.5
     )
+    complete_planes: bool = option(
+        True,
+        "Lay patches of even brightness on the planes that all views together show, where at least "
+        "half of what is known of a patch is on one and other views do not see through it.",
+    )

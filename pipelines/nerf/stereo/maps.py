@@ -113,6 +113,18 @@ def back_project(view: StereoView, z: NDArray[np.float32]) -> Floats:
     return world
 
 
+def surface_points(
+    views: Sequence[StereoView], depths: Sequence[NDArray[np.float32] | None]
+) -> Floats:
+    """Some points [P, 3], world, on what the depth maps know; None for a view without a map."""
+    found = [
+        thinned(back_project(view, z))
+        for view, z in zip(views, depths, strict=True)
+        if z is not None
+    ]
+    return thinned(np.concatenate(found)) if found else np.zeros((0, 3))
+
+
 def thinned(points: Floats) -> Floats:
     """At most 4,000 of the points [P, 3], evenly picked."""
     if len(points) <= _MAX_POINTS:
@@ -158,6 +170,27 @@ def agreed(
     config: StereoConfig,
 ) -> DepthMap:
     """A view's depths that enough neighbours confirm, and not more see through; averaged."""
+    depth = depths[index]
+    votes, sums = votes_of_others(index, views, depths, neighbours, config)
+    kept = (depth > 0) & (votes[AGREE] >= config.min_agreeing) & (votes[AGREE] > votes[SEE_THROUGH])
+    mean = (depth + sums) / (1.0 + votes[AGREE])
+    return DepthMap(
+        np.where(kept, mean, 0.0).astype(np.float32),
+        np.where(kept, votes[AGREE], 0).astype(np.uint8),
+    )
+
+
+def votes_of_others(
+    index: int,
+    views: Sequence[StereoView],
+    depths: Sequence[NDArray[np.float32]],
+    neighbours: Sequence[int],
+    config: StereoConfig,
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """What its neighbours' depths say of a view's; see `stereo.agreement`.
+
+    Returns ([3, H, W] votes; [H, W] sums of the depths, in this view, of those that agree).
+    """
     view, depth = views[index], depths[index]
     votes = np.zeros((3, *depth.shape), np.int32)
     sums = np.zeros(depth.shape, np.float32)
@@ -173,9 +206,4 @@ def agreed(
             votes,
             sums,
         )
-    kept = (depth > 0) & (votes[AGREE] >= config.min_agreeing) & (votes[AGREE] > votes[SEE_THROUGH])
-    mean = (depth + sums) / (1.0 + votes[AGREE])
-    return DepthMap(
-        np.where(kept, mean, 0.0).astype(np.float32),
-        np.where(kept, votes[AGREE], 0).astype(np.uint8),
-    )
+    return votes, sums

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import DepthMap, agreed, back_project, thinned
+from pipelines.nerf.stereo.maps import DepthMap, agreed, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.views import StereoView
 
@@ -58,22 +58,12 @@ def sensor_scale(stereo: Sequence[DepthMap], sensed: Sequence[Depths | None]) ->
     return SensorScale(float(np.exp(middle)) if trusted else 1.0, spread)
 
 
-def sensor_points(views: Sequence[StereoView], sensed: Sequence[Depths | None]) -> Floats:
-    """Some points [P, 3] on what the sensor saw, world."""
-    found = [
-        thinned(back_project(view, z))
-        for view, z in zip(views, sensed, strict=True)
-        if z is not None
-    ]
-    return thinned(np.concatenate(found)) if found else np.zeros((0, 3))
-
-
 def sensor_maps(
     views: Sequence[StereoView], sensed: Sequence[Depths | None], config: StereoConfig
 ) -> list[DepthMap]:
     """The sensor's maps without what other views' sensors contradict; averaged where they agree."""
     config = replace(config, min_agreeing=_MIN_AGREEING)
-    points = sensor_points(views, sensed)
+    points = surface_points(views, sensed)
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
     maps = [
         np.zeros(view.picture.shape, np.float32) if z is None else z

@@ -20,7 +20,8 @@ from pipelines.scene.depth_views import Pinhole
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
-STEREO = {"long_side_px": 64, "num_planes": 64, "window_radius": 2}
+STEREO = {"long_side_px": 64, "num_planes": 64, "window_radius": 2, "complete_planes": False}
+"""Without guesses, so that every depth is one that was matched or measured."""
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +51,18 @@ def test_maps_are_those_of_the_training_images_and_right(mapped: Workspace) -> N
     assert np.mean(shares) > 0.3
     assert np.median(np.concatenate(errors)) < 0.02
     assert (np.concatenate(errors) < 0.05).mean() > 0.8
+
+
+def test_plain_surfaces_are_completed(mapped: Workspace, tmp_path: Path) -> None:
+    known_before, right_before = how_right(mapped)
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=24)
+    summary = tiny_job.run(workspace, "depth", **STEREO | {"complete_planes": True})["summary"]
+    known, right = how_right(workspace)
+    assert known > known_before + 0.03
+    assert known * right > known_before * right_before + 0.03
+    assert right > right_before - 0.02
+    assert summary["matched_share"] == mapped.manifest("depth")["summary"]["known_share"]
+    assert summary["known_share"] == pytest.approx(known, abs=1e-3)
 
 
 def test_what_is_held_out_takes_no_part(mapped: Workspace, tmp_path: Path) -> None:

@@ -29,11 +29,16 @@ def paint(x: Floats, y: Floats, seed: int) -> Floats:
     return value
 
 
-def look(x: float, y: float = 0.0, *, with_box: bool = True) -> tuple[StereoView, Floats]:
-    """What a camera at (x, y, 0) sees that looks along +Z, and its depth [H, W]."""
-    lens = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+def look(
+    x: float, y: float = 0.0, *, with_box: bool = True, size: int = 1
+) -> tuple[StereoView, Floats]:
+    """What a camera at (x, y, 0) sees that looks along +Z, and its depth [H, W]; size: of it, in
+    units of WIDTH and HEIGHT.
+    """
+    width, height = size * WIDTH, size * HEIGHT
+    lens = (size * FOCAL, size * FOCAL, width / 2, height / 2)
     pose = np.column_stack([np.eye(3), [x, y, 0.0]])
-    view = StereoView(np.zeros((HEIGHT, WIDTH), np.float32), lens, pose)
+    view = StereoView(np.zeros((height, width), np.float32), lens, pose)
     columns, rows = (item.astype(np.float64) for item in view.rays())
     dx, dy = np.meshgrid(columns, rows)
     z = (WALL + SLOPE * x) / (1.0 - SLOPE * dx)
@@ -46,7 +51,9 @@ def look(x: float, y: float = 0.0, *, with_box: bool = True) -> tuple[StereoView
     return StereoView(picture.astype(np.float32), lens, pose), z
 
 
-def row_of_cameras(count: int = 7, step: float = 0.12) -> tuple[list[StereoView], list[Floats]]:
+def row_of_cameras(
+    count: int = 7, step: float = 0.12, size: int = 1
+) -> tuple[list[StereoView], list[Floats]]:
     """Cameras side by side, and their depths."""
-    seen = [look(step * (k - (count - 1) / 2), 0.03 * (k % 2)) for k in range(count)]
+    seen = [look(step * (k - (count - 1) / 2), 0.03 * (k % 2), size=size) for k in range(count)]
     return [view for view, _ in seen], [depth for _, depth in seen]

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import DepthMap
-from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_points, sensor_scale
+from pipelines.nerf.stereo.maps import DepthMap, surface_points
+from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_scale
 from tests.unit.pipelines.nerf.stereo.painted_wall import BOX, HEIGHT, WIDTH, row_of_cameras
 
 Depths = NDArray[np.float32]
@@ -52,7 +52,7 @@ def test_an_image_without_depth_has_an_empty_map() -> None:
     maps = sensor_maps(views, some, CONFIG)
     assert not maps[3].z.any()
     assert (maps[2].z > 0).mean() > 0.9
-    assert sensor_points(views, [None] * len(views)).shape == (0, 3)
+    assert surface_points(views, [None] * len(views)).shape == (0, 3)
 
 
 @pytest.mark.parametrize("unit", [0.001, 0.8, 1.25])
@@ -84,8 +84,8 @@ def test_stereo_is_finer_unless_it_is_far_off() -> None:
     assert both.votes.tolist() == [[4, 1, 2, 2, 0]]
 
 
-def test_sensor_points_lie_on_what_it_saw() -> None:
+def test_surface_points_lie_on_what_it_saw() -> None:
     views, depths = row_of_cameras()
-    points = sensor_points(views, sensed(depths))
+    points = surface_points(views, sensed(depths))
     assert len(points) == 4000
     assert points[:, 2].min() == pytest.approx(BOX, abs=1e-3)

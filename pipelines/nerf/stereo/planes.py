@@ -1,0 +1,253 @@
+"""Plain surfaces, which nothing can match, completed by the planes that the whole scene shows.
+
+A white wall says nothing of where it is, in no view; but its skirting board, a picture on it and
+its corners do, each in some view. So planes are sought among the known depths of **all** views, and
+in each view a patch of even brightness whose known pixels lie on one of them is taken to lie on it
+as a whole, unless other views see through it. Sources: Gallup, Frahm, Pollefeys, "Piecewise Planar
+and Non-Planar Stereo", CVPR 2010; Romanoni, Matteucci, "TAPA-MVS", arXiv:1903.10929; patches:
+Felzenszwalb, Huttenlocher, IJCV 2004.
+
+Symbols: V views, P planes (n, d) with n . X = d, n of length 1, in the world. Depth is along the
+camera's axis (z), 0 where unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.segmentation import felzenszwalb
+
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
+from pipelines.nerf.stereo.maps import DepthMap, Progress, surface_points, votes_of_others
+from pipelines.nerf.stereo.neighbours import choose_neighbours
+from pipelines.nerf.stereo.views import StereoView
+
+Depths = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+_SAMPLES_PER_VIEW, _MOST_SAMPLES = 800, 30_000
+_NORMAL_RADIUS = 3
+_MIN_VOTES = 2
+_ON_PLANE, _ALIGNED = 0.01, 0.9
+"""How near a point is to its plane, relative to its depth; |cosine| between their normals."""
+_MOST_PLANES, _HYPOTHESES, _LEAST_SHARE = 24, 300, 0.01
+_PATCH_SCALE, _PATCH_SIGMA, _PATCH_SIZE = 100.0, 0.8, 60
+_MIN_KNOWN, _MIN_SHARE = 30, 0.5
+_EXTRAPOLATED = 3.0
+"""How much nearer or farther than all its known pixels a patch may reach."""
+
+
+def completed(
+    views: Sequence[StereoView],
+    maps: Sequence[DepthMap],
+    config: StereoConfig,
+    on_progress: Progress = lambda fraction, message: None,
+) -> list[DepthMap]:
+    """The maps with their plain patches on the planes of the scene.
+
+    Depths within 1 % of their patch's plane move onto it; unknown pixels of the patch get its depth
+    unless more neighbours see through it than agree. All others stay as they are.
+    """
+    planes = find_planes(views, maps)
+    if len(planes) == 0:
+        return list(maps)
+    points = surface_points(views, [found.z for found in maps])
+    neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
+    filled = []
+    for index, (view, found) in enumerate(zip(views, maps, strict=True)):
+        filled.append(laid_on_planes(view, found.z, planes))
+        on_progress(0.5 * (index + 1) / len(views), "completing plain surfaces")
+    kept = []
+    for index, found in enumerate(maps):
+        votes, _ = votes_of_others(index, views, filled, neighbours[index], config)
+        guessed = (found.z == 0) & (filled[index] > 0)
+        refuted = guessed & (votes[AGREE] < votes[SEE_THROUGH])
+        kept.append(
+            DepthMap(
+                np.where(refuted, np.float32(0.0), filled[index]),
+                np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
+            )
+        )
+        on_progress(0.5 + 0.5 * (index + 1) / len(views), "completing plain surfaces")
+    return kept
+
+
+def find_planes(views: Sequence[StereoView], maps: Sequence[DepthMap]) -> Floats:
+    """The planes [P, 4] (n, d) that most of the known surfaces lie on, largest first.
+
+    One after the other by RANSAC over points with their normals; each has at least 1 % of them.
+    """
+    rng = np.random.default_rng(0)
+    points, normals, depths = _samples(views, maps, rng)
+    least = max(_LEAST_SHARE * len(points), _MIN_KNOWN)
+    planes: list[Floats] = []
+    while len(points) >= least and len(planes) < _MOST_PLANES:
+        tried = rng.choice(len(points), min(_HYPOTHESES, len(points)), replace=False)
+        candidates = np.column_stack(
+            [normals[tried], np.einsum("kc,kc->k", normals[tried], points[tried])]
+        )
+        counts = [_on_plane(plane, points, normals, depths).sum() for plane in candidates]
+        plane = candidates[int(np.argmax(counts))]
+        for _ in range(3):
+            members = _on_plane(plane, points, normals, depths)
+            if members.sum() < _MIN_KNOWN:
+                break
+            plane = _fitted(points[members], 1.0 / depths[members])
+        if _on_plane(plane, points, normals, depths).sum() < least:
+            break
+        planes.append(plane)
+        rest = ~_on_plane(plane, points, normals, depths, slack=2.0)
+        points, normals, depths = points[rest], normals[rest], depths[rest]
+    return np.array(planes).reshape(-1, 4)
+
+
+def laid_on_planes(view: StereoView, z: Depths, planes: Floats) -> Depths:
+    """A depth map [H, W] whose patches lie on the planes that their known pixels lie on.
+
+    planes: [P, 4]. A patch goes to the plane that most of its known pixels are within 2 % of, if
+    half of them are.
+    """
+    offsets = planes[:, 3] - planes[:, :3] @ view.center
+    apart = np.abs(offsets) > 1e-9
+    if not apart.any():
+        return z
+    # Along a ray to z = 1, the inverse depth of a plane is linear in the ray.
+    turned = planes[apart, :3] @ view.world_from_camera[:, :3] / offsets[apart, None]
+    on_planes = _rays(view).reshape(-1, 3) @ turned.T
+    known = z.ravel() > 0
+    inverse = np.where(known, 1.0 / np.where(known, z.ravel(), 1.0), 0.0)
+    near = known[:, None] & (
+        np.abs(on_planes - inverse[:, None]) < 2.0 * _ON_PLANE * inverse[:, None]
+    )
+    patches = _patches(view.picture).ravel()
+    num_patches = int(patches.max()) + 1
+    num_known = np.bincount(patches[known], minlength=num_patches)
+    num_near = np.stack(
+        [np.bincount(patches[column], minlength=num_patches) for column in near.T], axis=-1
+    )
+    best = num_near.argmax(axis=-1)
+    most = num_near.max(axis=-1)
+    decided = (num_known >= _MIN_KNOWN) & (most >= _MIN_SHARE * num_known)
+    plane = best[patches]
+    rows = np.arange(len(patches))
+    found, supported = on_planes[rows, plane], near[rows, plane]
+    nearest, farthest = np.zeros(num_patches), np.full(num_patches, np.inf)
+    np.maximum.at(nearest, patches[supported], inverse[supported])
+    np.minimum.at(farthest, patches[supported], inverse[supported])
+    within = found < _EXTRAPOLATED * nearest[patches]
+    within &= found > np.maximum(farthest[patches] / _EXTRAPOLATED, 1e-12)
+    fills = ~known & within & (view.picture.ravel() >= 0.0)
+    moves = known & (np.abs(found - inverse) < _ON_PLANE * inverse)
+    taken = decided[patches] & (fills | moves)
+    laid = np.where(taken, 1.0 / np.where(taken, found, 1.0), z.ravel())
+    return laid.reshape(z.shape).astype(np.float32)
+
+
+def _patches(picture: NDArray[np.float32]) -> NDArray[np.int64]:
+    """[H, W] numbers of the patches of even brightness."""
+    found: NDArray[np.int64] = felzenszwalb(
+        np.clip(picture, 0.0, 1.0).astype(np.float64),
+        scale=_PATCH_SCALE,
+        sigma=_PATCH_SIGMA,
+        min_size=_PATCH_SIZE,
+    )
+    return found
+
+
+def _rays(view: StereoView) -> Floats:
+    """[H, W, 3], to z = 1 in the camera's frame."""
+    x, y = view.rays()
+    height, width = view.picture.shape
+    return np.stack(
+        [
+            np.broadcast_to(x[None, :], (height, width)),
+            np.broadcast_to(y[:, None], (height, width)),
+            np.ones((height, width)),
+        ],
+        axis=-1,
+    ).astype(np.float64)
+
+
+def _samples(
+    views: Sequence[StereoView], maps: Sequence[DepthMap], rng: np.random.Generator
+) -> tuple[Floats, Floats, Floats]:
+    """(points [K, 3], unit normals [K, 3], both world; depths [K]) of some of the known pixels."""
+    points, normals, depths = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
+    for view, found in zip(views, maps, strict=True):
+        rays = _rays(view)
+        normal, sure = _normals(rays, found.z)
+        usable = np.flatnonzero(sure & (found.votes >= _MIN_VOTES))
+        picked = rng.choice(usable, min(len(usable), _SAMPLES_PER_VIEW), replace=False)
+        depth = found.z.ravel()[picked].astype(np.float64)
+        turn = view.world_from_camera[:, :3]
+        points.append(rays.reshape(-1, 3)[picked] * depth[:, None] @ turn.T + view.center)
+        normals.append(normal.reshape(-1, 3)[picked] @ turn.T)
+        depths.append(depth)
+    every = np.concatenate(points), np.concatenate(normals), np.concatenate(depths)
+    if len(every[0]) <= _MOST_SAMPLES:
+        return every
+    some = rng.choice(len(every[0]), _MOST_SAMPLES, replace=False)
+    return every[0][some], every[1][some], every[2][some]
+
+
+def _normals(rays: Floats, z: Depths) -> tuple[Floats, NDArray[np.bool_]]:
+    """Unit normals [H, W, 3] in the camera's frame, and where there are any [H, W].
+
+    By least squares of 1/z = a x + b y + c over the known pixels of a square around each, at least
+    half of it: on a plane that is exact, and (a, b, c) is its normal.
+    """
+    known = z > 0
+    inverse = np.where(known, 1.0 / np.where(known, z, 1.0), 0.0)
+    weight = known.astype(np.float64)
+    count = _box_sums(weight)
+    filled = np.maximum(count, 1.0)
+
+    def mean(values: Floats) -> Floats:
+        return _box_sums(values * weight) / filled
+
+    x, y = rays[..., 0], rays[..., 1]
+    mean_x, mean_y, mean_i = mean(x), mean(y), mean(inverse)
+    xx, yy = mean(x * x) - mean_x**2, mean(y * y) - mean_y**2
+    xy = mean(x * y) - mean_x * mean_y
+    xi, yi = mean(x * inverse) - mean_x * mean_i, mean(y * inverse) - mean_y * mean_i
+    spread = xx * yy - xy * xy
+    side = 2 * _NORMAL_RADIUS + 1
+    sure = known & (count > 0.5 * side * side) & (spread > 1e-14)
+    safe = np.where(sure, spread, 1.0)
+    a, b = (xi * yy - yi * xy) / safe, (yi * xx - xi * xy) / safe
+    normal = np.stack([a, b, mean_i - a * mean_x - b * mean_y], axis=-1)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return normal / np.maximum(length, 1e-12), sure & (length[..., 0] > 1e-12)
+
+
+def _box_sums(values: Floats) -> Floats:
+    """[H, W] sums over squares of side 2 _NORMAL_RADIUS + 1, cut at the border."""
+    radius = _NORMAL_RADIUS
+    height, width = values.shape
+    sums = np.zeros((height + 1, width + 1))
+    np.cumsum(np.cumsum(values, axis=0), axis=1, out=sums[1:, 1:])
+    top, bottom = (np.clip(np.arange(height) + d, 0, height) for d in (-radius, radius + 1))
+    left, right = (np.clip(np.arange(width) + d, 0, width) for d in (-radius, radius + 1))
+    rows = sums[bottom] - sums[top]
+    boxes: Floats = rows[:, right] - rows[:, left]
+    return boxes
+
+
+def _on_plane(
+    plane: Floats, points: Floats, normals: Floats, depths: Floats, slack: float = 1.0
+) -> NDArray[np.bool_]:
+    """[K]: which points lie on the plane and face as it does."""
+    away = np.abs(points @ plane[:3] - plane[3])
+    aligned = np.abs(normals @ plane[:3]) > 1.0 - slack * (1.0 - _ALIGNED)
+    on: NDArray[np.bool_] = (away < slack * _ON_PLANE * depths) & aligned
+    return on
+
+
+def _fitted(points: Floats, weights: Floats) -> Floats:
+    """The plane [4] of least weighted squared distance to the points [K, 3]."""
+    middle = weights @ points / weights.sum()
+    _, _, axes = np.linalg.svd((points - middle) * weights[:, None], full_matrices=False)
+    return np.append(axes[2], axes[2] @ middle)
