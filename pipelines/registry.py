@@ -115,7 +115,7 @@ STAGES: tuple[Stage, ...] = (
     *(_export_stage(export) for export in EXPORTS),
     Stage(
         name="assess",
-        version=3,
+        version=4,
         after=("evaluate", "pointcloud", "mesh"),
         reads=("ingest", "frames", "poses", "depth", "train", "evaluate", "pointcloud", "mesh"),
         run="pipelines.stages.assess:run",

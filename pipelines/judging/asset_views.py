@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import open3d
+import torch
 from numpy.typing import NDArray
 
 from pipelines.nerf.space.cameras import Cameras
@@ -122,12 +123,21 @@ class MeshCaster:
             _core.Tensor.from_numpy(self._faces),
         )
 
-    def view(self, cameras: Cameras, index: int) -> AssetView:
-        """What camera `index` sees."""
+    def view(self, cameras: Cameras, index: int, samples: int = 1) -> AssetView:
+        """What camera `index` sees.
+
+        samples: rays along each side of a pixel. With several, a pixel shows the mean of what they
+        meet, as a photo does; it is hit where half of them are, at their middle distance.
+        """
         width, height = cameras.size[index].tolist()
-        rays = cameras.image_rays(index)
-        angle = 1.0 / float(cameras.focal[index].mean())
-        return self.along(rays.origins.numpy(), rays.directions.numpy(), (height, width), angle)
+        angle = 1.0 / (samples * float(cameras.focal[index].mean()))
+        x = (torch.arange(width * samples, dtype=cameras.focal.dtype) + 0.5) / samples
+        y = (torch.arange(height * samples, dtype=cameras.focal.dtype) + 0.5) / samples
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+        rays = cameras.generate_rays(torch.full((len(pixels),), index), pixels)
+        shape = (height * samples, width * samples)
+        found = self.along(rays.origins.numpy(), rays.directions.numpy(), shape, angle)
+        return found if samples == 1 else _averaged(found, samples)
 
     def along(
         self, origins: Floats, directions: Floats, shape: tuple[int, ...], angle: float = 0.0
@@ -153,6 +163,28 @@ class MeshCaster:
             hit=hit.reshape(shape),
             distance=np.where(hit, distance, np.float32(0.0)).reshape(shape),
         )
+
+
+def _averaged(view: AssetView, side: int) -> AssetView:
+    """The view with `side` x `side` pixels as one."""
+    height, width = (length // side for length in view.hit.shape)
+
+    def squares(values: Floats) -> Floats:
+        """[height, width, side * side, ...]"""
+        split = values.reshape(height, side, width, side, *values.shape[2:])
+        return np.moveaxis(split, 2, 1).reshape(height, width, side * side, *values.shape[2:])
+
+    count = squares(view.hit.astype(np.float32)).sum(axis=2)
+    hit = 2.0 * count >= side * side
+    color = squares(view.color).sum(axis=2) / np.maximum(count, 1.0)[..., None]
+    sorted_distance = np.sort(squares(np.where(view.hit, view.distance, np.inf)), axis=2)
+    middle = np.maximum((count.astype(int) - 1) // 2, 0)[..., None]
+    distance = np.take_along_axis(sorted_distance, middle, axis=2)[..., 0]
+    return AssetView(
+        color=np.where(hit[..., None], color, 0.0).astype(np.float32),
+        hit=hit,
+        distance=np.where(hit, distance, 0.0).astype(np.float32),
+    )
 
 
 def point_spacing(points: Floats) -> NDArray[np.float32]:

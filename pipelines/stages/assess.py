@@ -51,6 +51,8 @@ from pipelines.workspace import Workspace
 
 NO_AGREED_DEPTH = "This job made no depth maps that views agree on."
 _AGREEMENT_VIEWS = 8
+_SAMPLES = 2
+"""Rays along each side of a pixel: a photo's pixel is the mean over a square, not one point."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ def _look_at_mesh(
     shown = set(evenly(len(views.posed), options.num_pictures)) if options.num_pictures else set()
     seen = _Seen([], [])
     for index, image in enumerate(views.posed):
-        view, photo = caster.view(views.cameras, index), views.photo(index)
+        view, photo = caster.view(views.cameras, index, _SAMPLES), views.photo(index)
         seen.views.append(view)
         seen.rows.append(score_view(view, photo, views.valid(index)))
         if index in shown:

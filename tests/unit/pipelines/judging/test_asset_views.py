@@ -49,6 +49,39 @@ def test_rays_are_those_of_the_bent_lens() -> None:
     assert view.color[32, 32] == pytest.approx(straight.color[32, 32], abs=1e-3)
 
 
+def test_several_rays_a_pixel_show_the_mean_over_it() -> None:
+    # A black stripe 2.6 px wide on white: whole pixels would make it 2 or 3 px wide.
+    half = 1.3 / 64.0 * DISTANCE
+    wide, faces, _ = wall()
+    strip, strip_faces, _ = wall(half=half, distance=DISTANCE * 0.999)
+    strip[:, 1] *= 50.0
+    vertices = np.concatenate([wide, strip])
+    colors = np.concatenate([np.ones((len(wide), 3)), np.zeros((len(strip), 3))])
+    caster = MeshCaster(vertices, np.concatenate([faces, strip_faces + len(wide)]), colors)
+    dark = [
+        float((1.0 - caster.view(camera(), 0, samples).color[32, :, 0]).sum())
+        for samples in (1, 2, 8)
+    ]
+    assert dark[0] in (2.0, 4.0)
+    assert abs(dark[2] - 2.6) <= abs(dark[1] - 2.6) < abs(dark[0] - 2.6)
+    assert dark[2] == pytest.approx(2.6, abs=0.15)
+    fine = caster.view(camera(), 0, 2)
+    assert fine.z_depth(camera(), 0)[2, 2] == pytest.approx(DISTANCE, rel=2e-2)
+
+
+def test_a_pixel_is_hit_where_half_of_its_rays_are() -> None:
+    for share, hit in ((0.3, False), (0.7, True)):
+        # The wall ends within pixel 40.
+        vertices, faces, colors = wall()
+        edge = (40 + share - 32.0) / 64.0 * DISTANCE
+        vertices = np.column_stack([np.minimum(vertices[:, 0], edge), vertices[:, 1:]])
+        view = MeshCaster(vertices, faces, colors).view(camera(), 0, 8)
+        assert view.hit[32, 39]
+        assert view.hit[32, 40] == hit
+        assert not view.hit[32, 41]
+        assert (view.distance > 0).tolist() == view.hit.tolist()
+
+
 def test_the_nearer_of_two_walls_and_its_back_are_seen_and_holes_are_not() -> None:
     near, near_faces, _ = wall(half=0.3, distance=1.0)
     far, far_faces, _ = wall(hole=0.5)
