@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from storage.db import Database
 from storage.jobs import StageSeed, create_job
 from storage.keys import capture_content
-from storage.models import Capture, Job, StageRow, new_id
+from storage.models import Base, Capture, Job, StageRow, new_id
 from storage.records import create_capture
 from storage.schema import upgrade
 
@@ -29,6 +29,13 @@ def make_database(folder: Path) -> Database:
     url = f"sqlite:///{folder / 'test.db'}"
     upgrade(url)
     return Database(url)
+
+
+def empty(database: Database) -> None:
+    """Delete every record of a PostgreSQL database."""
+    tables = ", ".join(Base.metadata.tables)
+    with database.engine.begin() as connection:
+        connection.exec_driver_sql(f"TRUNCATE {tables} CASCADE")
 
 
 def make_capture(session: Session, *, when: datetime | None = None, num_bytes: int = 3) -> Capture:

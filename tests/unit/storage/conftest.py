@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from storage.db import Database
-from storage.models import Base
 from storage.schema import upgrade
-from tests.factories import make_database
+from tests.factories import empty, make_database
 from tests.services import fresh_database
 
 
@@ -42,6 +41,4 @@ def either_database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[
         return
     made = request.getfixturevalue("postgres_store")
     yield made
-    tables = ", ".join(Base.metadata.tables)
-    with made.engine.begin() as connection:
-        connection.exec_driver_sql(f"TRUNCATE {tables} CASCADE")
+    empty(made)

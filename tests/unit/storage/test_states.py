@@ -6,9 +6,16 @@ import tempfile
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 from storage.claims import Claim, claim_stage
 from storage.db import Database
@@ -32,7 +39,7 @@ from storage.states import (
     JOB_TRANSITIONS,
     STAGE_TRANSITIONS,
 )
-from tests.factories import DIAMOND, make_database, make_job, states
+from tests.factories import DIAMOND, empty, make_database, make_job, states
 
 T0 = datetime(2026, 1, 1, tzinfo=UTC)
 ERROR = {"code": "e", "message": "m", "hint": "h"}
@@ -50,8 +57,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.folder = tempfile.TemporaryDirectory()
-        self.database: Database = make_database(Path(self.folder.name))
+        self.database = self.open_database()
         self.when = T0
         self.claims: list[Claim] = []
         with self.database.session_scope() as session:
@@ -73,6 +79,13 @@ class AnyOrder(RuleBasedStateMachine):
         assert self._states()["job"] in JOB_TERMINAL
         assert "running" not in self._states().values()
         self.check_events()
+        self.close_database()
+
+    def open_database(self) -> Database:
+        self.folder = tempfile.TemporaryDirectory()
+        return make_database(Path(self.folder.name))
+
+    def close_database(self) -> None:
         self.database.dispose()
         self.folder.cleanup()
 
@@ -203,3 +216,16 @@ class AnyOrder(RuleBasedStateMachine):
 
 AnyOrder.TestCase.settings = settings(max_examples=20, stateful_step_count=30, deadline=None)
 TestAnyOrder = AnyOrder.TestCase
+
+
+@pytest.mark.services
+def test_any_order_on_postgresql(postgres_store: Database) -> None:
+    class OnPostgres(AnyOrder):
+        def open_database(self) -> Database:
+            return postgres_store
+
+        def close_database(self) -> None:
+            empty(postgres_store)
+
+    few = settings(max_examples=4, stateful_step_count=25, deadline=None)
+    run_state_machine_as_test(OnPostgres, settings=few)
