@@ -1,6 +1,6 @@
 """One part that hangs (accepts, takes what is sent, never answers) does not stop the API.
 
-The bounds are generous, for a loaded machine; `tests/benchmarks/service_load` measures.
+The bounds are generous, for a loaded machine; `python -m tests.benchmarks.hung_broker` measures.
 """
 
 from __future__ import annotations
