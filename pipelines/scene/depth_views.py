@@ -100,10 +100,12 @@ class DepthView:
         return matrix
 
     def smooth_mask(self) -> Bools:
-        """[H, W] true where depth is known and does not jump to a neighbour.
+        """[H, W] true where depth is known and no neighbour is nearer by a jump.
 
-        At a jump a pixel's depth lies between two surfaces, on neither. A jump is a step steeper
-        than a surface seen at 84 degrees, and at least 2 % of the depth.
+        At a jump a pixel's depth may lie between two surfaces, on neither: such a pixel is the
+        farther one of a pair, and so is the first of what lies behind. The last one of what lies
+        before stays, or the edges of things would be eaten away. A jump is a step steeper than a
+        surface seen at 84 degrees, and at least 2 % of the depth.
         """
         z = self.z_depth
         limit = max(_SMALLEST_JUMP, _STEEPEST_SLOPE / min(self.lens.fl_x, self.lens.fl_y))
@@ -114,8 +116,8 @@ class DepthView:
             near[axis], far[axis] = slice(None, -1), slice(1, None)
             a, b = z[tuple(near)], z[tuple(far)]
             jump = np.abs(a - b) > limit * np.minimum(a, b)
-            good[tuple(near)] &= ~jump
-            good[tuple(far)] &= ~jump
+            good[tuple(near)] &= ~jump | (a < b)
+            good[tuple(far)] &= ~jump | (b < a)
         return good
 
 

@@ -20,8 +20,10 @@ Floats = NDArray[np.float64]
 
 _SMOOTH = 0.3
 _KEEP = 1e-3
-_MOST = 0.25
-"""A larger difference between two photos of a point is no exposure: one of them is wrong."""
+_MOST = 0.1
+"""Where the photos of a corner differ by so much more than these photos do elsewhere, one of them
+shows something else there: what lies behind the edge that the corner is on, or stands before it."""
+_OFFSET_ROUNDS, _LEAST_ERROR, _HOLD = 12, 0.01, 1e-3
 _ITERATIONS, _TOLERANCE = 300, 1e-4
 
 
@@ -32,9 +34,9 @@ def levels(charts: Charts, colors: Floats) -> Floats:
     """
     known = charts.photo[charts.chart] != NOBODY
     seams = _seams(charts, known)
-    difference = colors[seams[:, 1]] - colors[seams[:, 0]]
-    believed = (np.abs(difference) <= _MOST).all(axis=1)
-    seams, difference = seams[believed], difference[believed]
+    difference = _believed(
+        colors[seams[:, 1]] - colors[seams[:, 0]], charts.photo[charts.chart[seams]]
+    )
     edges = _edges(charts, known)
     count = len(charts.vertex)
     across, within = _differences(seams, count), _differences(edges, count)
@@ -49,6 +51,42 @@ def levels(charts: Charts, colors: Floats) -> Floats:
         found[:, channel], _ = cg(
             matrix, wanted, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=diags_array(scale)
         )
+    return found
+
+
+def _believed(difference: Floats, photos: NDArray[np.intp]) -> Floats:
+    """The differences [S, 3] at seams of two photos [S, 2]; those that are far from what the two
+    photos differ by elsewhere are replaced by that.
+    """
+    if len(difference) == 0:
+        return difference
+    expected = _offsets(difference, photos)
+    expected = expected[photos[:, 1]] - expected[photos[:, 0]]
+    off = (np.abs(difference - expected) > _MOST).any(axis=1)
+    return np.where(off[:, None], expected, difference)
+
+
+def _offsets(difference: Floats, photos: NDArray[np.intp]) -> Floats:
+    """How much brighter each photo is than others, [N, 3]: least absolute errors over all seams.
+
+    By least squares whose weights are the last round's 1 / error (Weiszfeld).
+    """
+    count = int(photos.max()) + 1
+    weights = np.ones(len(difference))
+    first, second = photos.T
+    found = np.zeros((count, 3))
+    for _ in range(_OFFSET_ROUNDS):
+        matrix = _HOLD * np.eye(count)
+        np.add.at(matrix, (first, first), weights)
+        np.add.at(matrix, (second, second), weights)
+        np.add.at(matrix, (first, second), -weights)
+        np.add.at(matrix, (second, first), -weights)
+        wanted = np.zeros((count, 3))
+        np.add.at(wanted, second, weights[:, None] * difference)
+        np.add.at(wanted, first, -weights[:, None] * difference)
+        found = np.linalg.solve(matrix, wanted)
+        error = np.abs(difference - (found[second] - found[first])).max(axis=1)
+        weights = 1.0 / np.maximum(error, _LEAST_ERROR)
     return found
 
 

@@ -121,6 +121,28 @@ def test_jumps_in_depth_are_masked_and_slopes_are_not(views: list[DepthView]) ->
     assert 0.85 < mask.sum() / seen.sum() < 1.0
 
 
+def test_at_a_jump_what_lies_before_keeps_its_edge_and_what_lies_between_goes() -> None:
+    z = np.full((1, 8), 2.0, np.float32)
+    z[0, 3:5] = 1.0
+    z[0, 5] = 1.6
+    row = DepthView(
+        Pinhole(8, 1, 800.0, 800.0, 4.0, 0.5),
+        np.eye(4)[:3],
+        np.zeros((1, 8, 3), np.uint8),
+        np.where(np.arange(8) == 7, 0, z).astype(np.float32),
+    )
+    #  far far edge NEAR NEAR between behind unknown
+    wanted = [True, True, False, True, True, False, False, False]
+    assert row.smooth_mask()[0].tolist() == wanted
+    column = DepthView(
+        Pinhole(1, 8, 800.0, 800.0, 0.5, 4.0),
+        row.world_from_camera,
+        np.zeros((8, 1, 3), np.uint8),
+        row.z_depth.T,
+    )
+    assert column.smooth_mask()[:, 0].tolist() == wanted
+
+
 def test_z_depth_takes_the_median_where_the_expected_depth_was_pulled_away() -> None:
     lens = Pinhole(3, 1, 1.0, 1.0, 1.5, 0.5)
     median = np.array([[2.0, 2.0, 2.0]])

@@ -46,6 +46,17 @@ def test_stripes_finer_than_triangles_are_there_and_in_place(tmp_path: Path) -> 
     assert (textured.uv <= 1).all()
 
 
+def test_a_corner_on_the_edge_of_a_photos_ball_brightens_no_face(tmp_path: Path) -> None:
+    """There the photo shows half the dark ground; that is no difference in exposure."""
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    )
+    textured = texture_from_photos(painted_ball.ball(24), photos, 1024)
+    points, found, faces = surface_samples(textured)
+    brighter = np.bincount(faces, (found - stripes(on_ball(points))).mean(axis=1)) / 4.0
+    assert brighter.max() < 0.06
+
+
 def test_a_lens_that_bends_is_heeded(tmp_path: Path) -> None:
     """The same photos said to be of a bending lens: the stripes end up elsewhere."""
     images = painted_ball.write_photos(tmp_path, painted_ball.all_round())
