@@ -24,7 +24,8 @@ up: install ## Keep the service running here: make up [PORT=8000] [HOST=0.0.0.0]
 	@$(BIN)/python -m deploy.local
 
 test: install-test ## Install what the tests need and run them all
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile tests --ignore tests/integration --ignore tests/e2e
+	@$(BIN)/python -m pytest tests/integration tests/e2e
 
 check: install-test ## Lint, types and import rules
 	@$(BIN)/ruff format --check .
