@@ -8,6 +8,8 @@ Lempitsky and Ivanov, "Seamless mosaicing of image-based texture maps", CVPR 200
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
@@ -54,37 +56,38 @@ def levels(charts: Charts, colors: Floats) -> Floats:
     return found
 
 
-def _believed(difference: Floats, photos: NDArray[np.intp]) -> Floats:
+def _believed(difference: Floats, photos: NDArray[np.integer[Any]]) -> Floats:
     """The differences [S, 3] at seams of two photos [S, 2]; those that are far from what the two
     photos differ by elsewhere are replaced by that.
     """
     if len(difference) == 0:
         return difference
-    expected = _offsets(difference, photos)
-    expected = expected[photos[:, 1]] - expected[photos[:, 0]]
-    off = (np.abs(difference - expected) > _MOST).any(axis=1)
-    return np.where(off[:, None], expected, difference)
+    offsets = _offsets(difference, photos)
+    expected = offsets[photos[:, 1]] - offsets[photos[:, 0]]
+    far_off = np.abs(difference - expected).max(axis=1) > _MOST
+    believed: Floats = np.where(far_off[:, None], expected, difference)
+    return believed
 
 
-def _offsets(difference: Floats, photos: NDArray[np.intp]) -> Floats:
+def _offsets(difference: Floats, photos: NDArray[np.integer[Any]]) -> Floats:
     """How much brighter each photo is than others, [N, 3]: least absolute errors over all seams.
 
     By least squares whose weights are the last round's 1 / error (Weiszfeld).
     """
     count = int(photos.max()) + 1
+    first, second = photos.T.astype(np.int64)
     weights = np.ones(len(difference))
-    first, second = photos.T
     found = np.zeros((count, 3))
     for _ in range(_OFFSET_ROUNDS):
-        matrix = _HOLD * np.eye(count)
-        np.add.at(matrix, (first, first), weights)
-        np.add.at(matrix, (second, second), weights)
-        np.add.at(matrix, (first, second), -weights)
-        np.add.at(matrix, (second, first), -weights)
-        wanted = np.zeros((count, 3))
-        np.add.at(wanted, second, weights[:, None] * difference)
-        np.add.at(wanted, first, -weights[:, None] * difference)
-        found = np.linalg.solve(matrix, wanted)
+        pairs = np.bincount(first * count + second, weights, count * count).reshape(count, count)
+        pairs = pairs + pairs.T
+        matrix = np.diag(pairs.sum(axis=1) + _HOLD) - pairs
+        wanted = [
+            np.bincount(second, weights * values, count)
+            - np.bincount(first, weights * values, count)
+            for values in difference.T
+        ]
+        found = np.asarray(np.linalg.solve(matrix, np.stack(wanted, axis=-1)), np.float64)
         error = np.abs(difference - (found[second] - found[first])).max(axis=1)
         weights = 1.0 / np.maximum(error, _LEAST_ERROR)
     return found
