@@ -28,6 +28,8 @@ WIDEST_SPACING = 3.0
 """A lone point's spacing is at most so many medians, or it would hide half a picture."""
 MAX_RADIUS_PX = 6
 """A point is drawn at most this large: what is right before the camera must not hide the rest."""
+_MOST_RAYS = 1_000_000
+"""Cast at a time: each takes some hundred bytes."""
 _TEXTURE_LEVELS = 4
 """Farther copies would mix in what lies beside a patch."""
 
@@ -130,12 +132,29 @@ class MeshCaster:
         meet, as a photo does; it is hit where half of them are, at their middle distance.
         """
         width, height = cameras.size[index].tolist()
+        rows = max(1, _MOST_RAYS // (width * samples * samples))
+        strips = [
+            self._strip(cameras, index, range(top, min(top + rows, height)), samples)
+            for top in range(0, height, rows)
+        ]
+        return AssetView(
+            color=np.concatenate([strip.color for strip in strips]),
+            hit=np.concatenate([strip.hit for strip in strips]),
+            distance=np.concatenate([strip.distance for strip in strips]),
+        )
+
+    def _strip(self, cameras: Cameras, index: int, rows: range, samples: int) -> AssetView:
+        """Some rows of what camera `index` sees."""
+        width = int(cameras.size[index, 0])
         angle = 1.0 / (samples * float(cameras.focal[index].mean()))
-        x = (torch.arange(width * samples, dtype=cameras.focal.dtype) + 0.5) / samples
-        y = (torch.arange(height * samples, dtype=cameras.focal.dtype) + 0.5) / samples
-        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+        shape = (len(rows) * samples, width * samples)
+        x, y = (
+            (torch.arange(length, dtype=cameras.focal.dtype) + 0.5) / samples
+            for length in shape[::-1]
+        )
+        pixels = torch.stack(torch.meshgrid(x, y + rows.start, indexing="xy"), dim=-1)
+        pixels = pixels.reshape(-1, 2)
         rays = cameras.generate_rays(torch.full((len(pixels),), index), pixels)
-        shape = (height * samples, width * samples)
         found = self.along(rays.origins.numpy(), rays.directions.numpy(), shape, angle)
         return found if samples == 1 else _averaged(found, samples)
 

@@ -13,7 +13,7 @@ camera's axis (z), 0 where unknown.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ _ON_PLANE, _ALIGNED = 0.01, 0.9
 _MOST_PLANES, _HYPOTHESES, _LEAST_SHARE = 24, 300, 0.01
 _PATCH_SCALE, _PATCH_SIGMA, _PATCH_SIZE = 100.0, 0.8, 60
 _MIN_KNOWN, _MIN_SHARE = 30, 0.5
+_SAMPLES_SHARE, _VOTES_SHARE = 0.25, 0.35
+_MESSAGE = "completing plain surfaces"
 _EXTRAPOLATED = 3.0
 """How much nearer or farther than all its known pixels a patch may reach."""
 
@@ -51,7 +53,7 @@ def completed(
     Depths within 1 % of their patch's plane move onto it; unknown pixels of the patch get its depth
     unless more neighbours see through it than agree. All others stay as they are.
     """
-    planes = find_planes(views, maps)
+    planes = find_planes(views, maps, lambda f: on_progress(_SAMPLES_SHARE * f, _MESSAGE))
     if len(planes) == 0:
         return list(maps)
     points = surface_points(views, [found.z for found in maps])
@@ -59,7 +61,8 @@ def completed(
     filled = []
     for index, (view, found) in enumerate(zip(views, maps, strict=True)):
         filled.append(laid_on_planes(view, found.z, planes))
-        on_progress(0.5 * (index + 1) / len(views), "completing plain surfaces")
+        share = (1.0 - _VOTES_SHARE - _SAMPLES_SHARE) * (index + 1) / len(views)
+        on_progress(_SAMPLES_SHARE + share, _MESSAGE)
     kept = []
     for index, found in enumerate(maps):
         votes, _ = votes_of_others(index, views, filled, neighbours[index], config)
@@ -71,17 +74,22 @@ def completed(
                 np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
             )
         )
-        on_progress(0.5 + 0.5 * (index + 1) / len(views), "completing plain surfaces")
+        on_progress(1.0 - _VOTES_SHARE * (1.0 - (index + 1) / len(views)), _MESSAGE)
     return kept
 
 
-def find_planes(views: Sequence[StereoView], maps: Sequence[DepthMap]) -> Floats:
+def find_planes(
+    views: Sequence[StereoView],
+    maps: Sequence[DepthMap],
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> Floats:
     """The planes [P, 4] (n, d) that most of the known surfaces lie on, largest first.
 
     One after the other by RANSAC over points with their normals; each has at least 1 % of them.
+    on_progress: told the share that is done; may raise.
     """
     rng = np.random.default_rng(0)
-    points, normals, depths = _samples(views, maps, rng)
+    points, normals, depths = _samples(views, maps, rng, on_progress)
     least = max(_LEAST_SHARE * len(points), _MIN_KNOWN)
     planes: list[Floats] = []
     while len(points) >= least and len(planes) < _MOST_PLANES:
@@ -116,34 +124,37 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats) -> Depths:
         return z
     # Along a ray to z = 1, the inverse depth of a plane is linear in the ray.
     turned = planes[apart, :3] @ view.world_from_camera[:, :3] / offsets[apart, None]
-    on_planes = _rays(view).reshape(-1, 3) @ turned.T
-    known = z.ravel() > 0
-    inverse = np.where(known, 1.0 / np.where(known, z.ravel(), 1.0), 0.0)
-    near = known[:, None] & (
-        np.abs(on_planes - inverse[:, None]) < 2.0 * _ON_PLANE * inverse[:, None]
-    )
-    patches = _patches(view.picture).ravel()
+    x, y = (axis.astype(np.float64) for axis in view.rays())
+    known = z > 0
+    inverse = np.where(known, 1.0 / np.where(known, z, 1.0), 0.0)
+    patches = _patches(view.picture)
     num_patches = int(patches.max()) + 1
-    num_known = np.bincount(patches[known], minlength=num_patches)
+
+    def near(found: Floats) -> NDArray[np.bool_]:
+        return known & (np.abs(found - inverse) < 2.0 * _ON_PLANE * inverse)
+
     num_near = np.stack(
-        [np.bincount(patches[column], minlength=num_patches) for column in near.T], axis=-1
+        [
+            np.bincount(patches[near(x * a + (y * b + c)[:, None])], minlength=num_patches)
+            for a, b, c in turned
+        ],
+        axis=-1,
     )
-    best = num_near.argmax(axis=-1)
-    most = num_near.max(axis=-1)
-    decided = (num_known >= _MIN_KNOWN) & (most >= _MIN_SHARE * num_known)
-    plane = best[patches]
-    rows = np.arange(len(patches))
-    found, supported = on_planes[rows, plane], near[rows, plane]
+    num_known = np.bincount(patches[known], minlength=num_patches)
+    decided = (num_known >= _MIN_KNOWN) & (num_near.max(axis=-1) >= _MIN_SHARE * num_known)
+    chosen = turned[num_near.argmax(axis=-1)][patches]
+    found = x * chosen[..., 0] + y[:, None] * chosen[..., 1] + chosen[..., 2]
+    supported = near(found)
     nearest, farthest = np.zeros(num_patches), np.full(num_patches, np.inf)
     np.maximum.at(nearest, patches[supported], inverse[supported])
     np.minimum.at(farthest, patches[supported], inverse[supported])
     within = found < _EXTRAPOLATED * nearest[patches]
     within &= found > np.maximum(farthest[patches] / _EXTRAPOLATED, 1e-12)
-    fills = ~known & within & (view.picture.ravel() >= 0.0)
+    fills = ~known & within & (view.picture >= 0.0)
     moves = known & (np.abs(found - inverse) < _ON_PLANE * inverse)
     taken = decided[patches] & (fills | moves)
-    laid = np.where(taken, 1.0 / np.where(taken, found, 1.0), z.ravel())
-    return laid.reshape(z.shape).astype(np.float32)
+    laid: Depths = np.where(taken, 1.0 / np.where(taken, found, 1.0), z).astype(np.float32)
+    return laid
 
 
 def _patches(picture: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -172,11 +183,15 @@ def _rays(view: StereoView) -> Floats:
 
 
 def _samples(
-    views: Sequence[StereoView], maps: Sequence[DepthMap], rng: np.random.Generator
+    views: Sequence[StereoView],
+    maps: Sequence[DepthMap],
+    rng: np.random.Generator,
+    on_progress: Callable[[float], None],
 ) -> tuple[Floats, Floats, Floats]:
     """(points [K, 3], unit normals [K, 3], both world; depths [K]) of some of the known pixels."""
     points, normals, depths = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
-    for view, found in zip(views, maps, strict=True):
+    for done, (view, found) in enumerate(zip(views, maps, strict=True), start=1):
+        on_progress(done / len(views))
         rays = _rays(view)
         normal, sure = _normals(rays, found.z)
         usable = np.flatnonzero(sure & (found.votes >= _MIN_VOTES))

@@ -28,7 +28,7 @@ def train(process: StageProcess, root: Path) -> dict[str, Any]:
     options = options_of("train", max_steps=3, rays_per_step=128)
     process.start_run(
         root.name, lines.append, stage="train", options=options, root=str(workspace.root), seed=0,
-        threads=2,
+        threads=2, token="a-token",
     )  # fmt: skip
     while True:
         message = process.messages.get(timeout=300)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.judging import asset_views
 from pipelines.judging.asset_views import (
     MAX_RADIUS_PX,
     MeshCaster,
@@ -67,6 +68,17 @@ def test_several_rays_a_pixel_show_the_mean_over_it() -> None:
     assert dark[2] == pytest.approx(2.6, abs=0.15)
     fine = caster.view(camera(), 0, 2)
     assert fine.z_depth(camera(), 0)[2, 2] == pytest.approx(DISTANCE, rel=2e-2)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_strips_show_what_the_whole_shows(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces, colors = wall(hole=0.5)
+    caster = MeshCaster(vertices, faces, colors)
+    whole = caster.view(camera(BENT), 0, samples)
+    monkeypatch.setattr(asset_views, "_MOST_RAYS", 7 * SIDE * samples * samples)
+    strips = caster.view(camera(BENT), 0, samples)
+    for one, other in zip(vars(whole).values(), vars(strips).values(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_pixel_is_hit_where_half_of_its_rays_are() -> None:
