@@ -34,7 +34,7 @@ def _export_stage(export: Export) -> Stage:
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=5,
+        version=6,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",

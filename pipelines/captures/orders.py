@@ -1,12 +1,18 @@
-"""The orders in which rows of poses that name no picture may belong to pictures. Standard library
-only; which of them is right the pictures tell (`pipelines.captures.pose_order`)."""
+"""Which file or row belongs to which picture, where nothing but names and places says so.
+
+The orders in which rows of poses that name no picture may belong to pictures: which of them is
+right the pictures tell (`pipelines.captures.pose_order`). And files that lie beside pictures, one
+for each. Standard library only.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 
+from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedSource, Reading
+from pipelines.captures.parsing import malformed
 from pipelines.scene.natural_order import natural_key
 
 COUNTED = "in the order in which people count names"
@@ -75,3 +81,51 @@ def numbered(names: Iterable[str]) -> dict[int, str]:
         if number is not None:
             found.setdefault(number, name)
     return dict(sorted(found.items()))
+
+
+def paired(names: Iterable[str], others: Iterable[str]) -> dict[str, str]:
+    """The file among `others` that belongs to each name, in the order in which people count names.
+
+    Files with equal names belong together: without folders and suffixes, without what says a
+    frame's part (`.color`, `.depth`, `.pose`), and without the zeros that numbers start with. Only
+    where no names are equal the last numbers in them tell ("frame7.jpg", "depth0007.png"). Of names
+    that differ in their suffix alone the first is taken.
+    Raises CaptureError poses_malformed where several files of a side would do: nothing is guessed.
+    """
+    theirs = sorted(others, key=natural_key)
+    first: dict[str, str] = {}
+    for name in sorted(names, key=natural_key):
+        first.setdefault(name.rpartition(".")[0], name)
+    ours = list(first.values())
+    for key in (_stem, frame_number):
+        mine, its = _by_key(ours, key), _by_key(theirs, key)
+        both = [name for name in mine if name in its]
+        for side in (mine, its):
+            several = next((side[name] for name in both if len(side[name]) > 1), None)
+            if several is not None:
+                same = "name" if key is _stem else "number, and no names are equal"
+                raise malformed(
+                    f'"{shown(several[0])}" and "{shown(several[1])}" have the same {same}: it '
+                    "cannot be told which belongs to which picture.",
+                    "Give a picture, its pose and its depth the same name.",
+                )
+        if both:
+            return {mine[name][0]: its[name][0] for name in both}
+    return {}
+
+
+def _by_key(names: Iterable[str], key: Callable[[str], Hashable]) -> dict[Hashable, list[str]]:
+    found: dict[Hashable, list[str]] = {}
+    for name in names:
+        if (value := key(name)) is not None:
+            found.setdefault(value, []).append(name)
+    return found
+
+
+_PART = re.compile(r"\.(color|depth|pose)$")
+_ZEROS = re.compile(r"(?<![0-9])0+(?=[0-9])")
+
+
+def _stem(name: str) -> str:
+    """A file's name without what `paired` does without."""
+    return _ZEROS.sub("", _PART.sub("", name.rpartition("/")[2].rpartition(".")[0]))

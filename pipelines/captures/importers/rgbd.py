@@ -30,7 +30,7 @@ from pipelines.captures.matrix_files import (
     read_matrix,
     starts_with_numbers,
 )
-from pipelines.captures.orders import numbered, orders, readings_of
+from pipelines.captures.orders import orders, paired, readings_of
 from pipelines.captures.parsing import each_frame, missing, opengl_camera, some_of
 from pipelines.captures.rgbd_lenses import (
     REPLICA,
@@ -109,12 +109,14 @@ def _lists(listing: Listing, with_photos: set[str]) -> Iterable[Claim]:
 def _rgbd_roots(listing: Listing, with_photos: set[str], roots: Iterable[str]) -> Iterable[str]:
     """Those of the folders that have pictures, and intrinsics or depth: numbers beside photos
     alone are mostly something else."""
-    with_depth = {_above(name) for name in listing.pictures if name.endswith(".png")}
+    maps = [name for name in listing.pictures if name.endswith(".png")]
+    with_maps = {_above(name) for name in maps}
+    with_named_maps = {_above(name) for name in maps if file_role(name) == "depth maps"}
     for root in roots:
-        depths = (f"{root}{folder}/" for folder in _DEPTH_FOLDERS)
-        if _photo_folder(with_photos, root) and (
-            find_lens_file(listing.heads, root) or any(folder in with_depth for folder in depths)
-        ):
+        photos = _photo_folder(with_photos, root)
+        depths = {f"{root}{folder}/" for folder in _DEPTH_FOLDERS}
+        has_depth = depths & (with_maps - {photos}) or depths & with_named_maps
+        if photos and (find_lens_file(listing.heads, root) or has_depth):
             yield root
 
 
@@ -147,12 +149,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         folder = _photo_folder({_above(n) for n in archive.images if file_role(n) is None}, root)
         pictures = [n for n in archive.images if _above(n) == folder and file_role(n) is None]
         maps = _depth_maps(archive, root, pictures)
-    by_number = numbered(maps)
-    depths = {
-        name: SensorDepth(by_number[n], camera.depth_unit)
-        for n, name in numbered(pictures).items()
-        if n in by_number and camera.depth_unit is not None
-    }
+    depths, told = _depths(archive, pictures, maps, camera)
     if listed:
         found = _by_list(archive, root + claim.why, pictures, camera, depths)
     else:
@@ -167,7 +164,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         up="unknown" if claim.why == _BESIDE else "assumed",
         notes={"world": "as in the files of poses"},
         details={"num_poses": found.num_poses, "num_frames": len(pictures)},
-        warnings=[*camera.warnings, *found.warnings, *_without_depth(found, depths)],
+        warnings=[*camera.warnings, *told, *found.warnings, *_without_depth(found, depths)],
     )
 
 
@@ -181,15 +178,32 @@ def _frames(names: Iterable[str], root: str, role: str) -> list[str]:
 
 
 def _depth_maps(archive: CaptureArchive, root: str, photos: Iterable[str]) -> list[str]:
-    """The PNGs of the first folder of depth that has any, beside the photos or apart from them."""
+    """The PNGs of the first folder of depth that has any, beside the photos or apart from them;
+    of those only what is called depth, where anything there is."""
     taken = frozenset(photos)
     for folder in _DEPTH_FOLDERS:
         whole = f"{root}{folder}/"
         maps = [name for name in archive.names - taken if _above(name) == whole]
         maps = [name for name in maps if name.endswith(".png")]
+        called = [name for name in maps if file_role(name) == "depth maps"]
         if maps:
-            return maps
+            return called or maps
     return []
+
+
+def _depths(
+    archive: CaptureArchive, pictures: Sequence[str], maps: Sequence[str], camera: RgbdCamera
+) -> tuple[dict[str, SensorDepth], list[str]]:
+    """The depth of pictures, by their names; and why there is none, where that is to be told."""
+    unit = camera.depth_unit
+    if unit is None:
+        return {}, []
+    try:
+        both = paired(pictures, maps)
+    except CaptureError as error:
+        archive.told(maps)
+        return {}, [f"{len(maps)} depth maps are not used. {error.message}"]
+    return {name: SensorDepth(file, unit) for name, file in both.items()}, []
 
 
 def _by_files(
@@ -200,14 +214,14 @@ def _by_files(
     camera: RgbdCamera,
     depths: Mapping[str, SensorDepth],
 ) -> _Found:
-    """Pictures that have a file with their pose: of the same number in its name."""
+    """Pictures that have a file with their pose: of the same name, or number in it."""
     texts = [name for name in archive.names if name.endswith(".txt")]
     if layout == _BESIDE:
         files = [n for n in texts if _above(n) == root and n.endswith(".pose.txt")]
     else:
         folders = {f"{root}{folder}/" for folder in _POSE_FOLDERS}
         files = [name for name in texts if _above(name) in folders]
-    poses, photos = numbered(files), numbered(pictures)
+    both = paired(pictures, files)
     lost: list[str] = []
 
     def source(name: str, file: str) -> PosedSource | None:
@@ -217,14 +231,14 @@ def _by_files(
             return None
         return _source(name, values, f'"{shown(file)}"', camera, depths)
 
-    both = {photos[n]: poses[n] for n in photos if n in poses}
     if not both:
-        raise missing("No picture has a file with its pose: the numbers in the names do not meet.")
+        raise missing("No picture has a file with its pose: neither names nor numbers are equal.")
     sources, failures = each_frame(archive, both, source)
     if not sources and not failures:
         raise missing(f"None of the {len(both)} poses is one: the camera had lost its way in all.")
     without = [name for name in pictures if name not in both]
-    no_file = [poses[n] for n in poses if n not in photos]
+    used = set(both.values())
+    no_file = [name for name in files if name not in used]
     warnings = []
     if without:
         warnings.append(f"{len(without)} pictures have no pose: {some_of(without)}.")
@@ -232,7 +246,7 @@ def _by_files(
     if no_file:
         warnings.append(f"{len(no_file)} poses have no picture: {some_of(no_file)}.")
         archive.told(no_file)
-    return _Found(sources, failures, len(poses), lost=lost, warnings=warnings)
+    return _Found(sources, failures, len(files), lost=lost, warnings=warnings)
 
 
 def _by_list(

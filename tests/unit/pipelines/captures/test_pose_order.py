@@ -12,7 +12,7 @@ from pipelines.captures.archive_rules import ArchiveLimits
 from pipelines.captures.contents import Reading
 from pipelines.captures.importer import Claim
 from pipelines.captures.importers import llff
-from pipelines.captures.orders import AS_TEXT, COUNTED, FROM_0, FROM_1, frame_number, orders
+from pipelines.captures.orders import AS_TEXT, COUNTED, FROM_0, FROM_1, frame_number, orders, paired
 from pipelines.captures.pose_order import epipolar_distances, proven
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -109,3 +109,37 @@ def test_rows_pair_with_names(names: list[str], num_rows: int, found: dict[str, 
 )
 def test_the_last_number_of_a_name_counts(name: str, number: int | None) -> None:
     assert frame_number(name) == number
+
+
+@pytest.mark.parametrize(
+    ("names", "others", "found"),
+    [
+        (["a/7.jpg", "a/10.jpg"], ["b/0007.txt", "b/0010.txt"], [0, 1]),
+        (["frame-01.color.png"], ["frame-02.pose.txt", "frame-01.pose.txt"], [1]),
+        (["f7.jpg", "f10.jpg"], ["depth10.png", "depth7.png"], [1, 0]),
+        (["0_cam1.png", "1_cam1.png"], ["1_cam1.txt", "0_cam1.txt"], [1, 0]),
+        (["1_00.png", "1_01.png"], ["0_00.txt", "0_01.txt", "1_00.txt", "1_01.txt"], [2, 3]),
+        (["1_00.png", "1_01.png"], ["0_00.txt", "0_01.txt", "1_00.txt"], [2, None]),
+        (["1.jpg", "1.png"], ["1.txt"], [0, None]),
+        (["t1305031102175304000.png"], ["t1305031102175304000.txt"], [0]),
+        (["a.jpg"], ["b.txt"], [None]),
+        (["f0.png", "f1.png"], ["a_0.txt", "b_0.txt"], "a_0"),
+        (["a_0.png", "b_0.png"], ["pose0.txt"], "a_0"),
+        (["1.png"], ["pose/1.txt", "poses/1.txt"], "pose/1"),
+        (["1.png", "01.png"], ["1.txt"], "1"),
+    ],
+)
+def test_files_pair_by_name_and_only_then_by_number(
+    names: list[str], others: list[str], found: list[int | None] | str
+) -> None:
+    """found: the place in `others` of each name's file; or the file that two would do for."""
+    if isinstance(found, str):
+        with pytest.raises(CaptureError) as caught:
+            paired(names, others)
+        assert caught.value.code == "poses_malformed"
+        assert f'"{found}.' in caught.value.message
+    else:
+        expected = {
+            name: others[at] for name, at in zip(names, found, strict=True) if at is not None
+        }
+        assert paired(names, others) == expected

@@ -77,6 +77,35 @@ def test_frames_pair_by_number_and_gaps_are_told(tmp_path: Path, layout: str) ->
     assert warning_with(summary, "1 of 6 pictures have no depth map")
 
 
+def test_poses_and_depth_of_another_recording_are_not_taken_for_this_ones(tmp_path: Path) -> None:
+    """As NSVF names its splits: pictures 1_n, and poses and depth of 0_n before theirs."""
+    files: Files = {"K.txt": rgbd_files(1, "list")["K.txt"]}
+    for name, data in rgbd_files(6).items():
+        if name[-5].isdigit():
+            for split in (1, 0) if not name.startswith("color") else (1,):
+                other = data if split else rgbd_files(1)[name.replace(name[-5], "0")]
+                files[name.replace("/", f"/{split}_000")] = other
+    summary, ctx = ingest(tmp_path, files)
+    assert list(poses_as_sent(ctx)[:, 0, 3]) == [0, 1, 2, 3, 4, 5]
+    assert [round(float(depth_of(ctx, n)[0, 0]), 2) for n in (0, 3, 5)] == [1.0, 1.03, 1.05]
+    assert warning_with(summary, "6 poses have no picture", "0_0000.txt")
+
+
+def test_numbers_that_come_twice_are_no_pairing(tmp_path: Path) -> None:
+    """Of poses they refuse the capture, of depth they cost the depth, and both are told."""
+    files = rgbd_files(4)
+    twice = {f"depth/{side}_{n}.png": files[f"depth/{n}.png"] for n in range(4) for side in "lr"}
+    kept = {name: data for name, data in files.items() if not name.startswith("depth")}
+    summary, _ = ingest(tmp_path, kept | twice)
+    assert (summary["num_posed"], summary["num_depths"]) == (4, 0)
+    assert warning_with(summary, "8 depth maps are not used", "cannot be told")
+    poses = {f"pose/{side}_{n}.txt": files[f"pose/{n}.txt"] for n in range(4) for side in "lr"}
+    kept = {name: data for name, data in files.items() if not name.startswith("pose")}
+    error = failure(tmp_path / "poses", kept | poses)
+    assert error.code == "poses_malformed"
+    assert "same number, and no names are equal" in error.message
+
+
 def test_frames_in_which_the_camera_was_lost_are_told_and_no_fault(tmp_path: Path) -> None:
     files = rgbd_files(9) | {f"pose/{n}.txt": LOST for n in range(4)}
     summary, ctx = ingest(tmp_path, files)
