@@ -108,7 +108,10 @@ def create_job(
     deleted capture, ValueError for stages that nothing could start.
     """
     when = when or now(session)
-    capture = session.get(Capture, capture_id, with_for_update={"read": True})
+    # Looked at anew: the caller may have read it before another deleted it.
+    capture = session.get(
+        Capture, capture_id, with_for_update={"read": True}, populate_existing=True
+    )
     if capture is None or capture.deleted_at is not None:
         raise NotFoundError("capture", capture_id)
     names = [stage.name for stage in stages]
@@ -172,6 +175,18 @@ def open_for_retry(session: Session, job_id: str) -> Job:
     return session.scalars(query.options(joinedload(Job.capture), loaded)).one()
 
 
+def _with_other_inputs(stages: Sequence[StageRow], redo: Collection[str]) -> set[str]:
+    """The stages behind those that are done again, also behind skipped ones, which pass through.
+
+    stages: in order.
+    """
+    moved: set[str] = set()
+    for row in stages:
+        if any(name in redo or name in moved for name in row.after):
+            moved.add(row.name)
+    return moved
+
+
 def retry_job(
     session: Session,
     job: Job,
@@ -187,17 +202,23 @@ def retry_job(
     job: from `open_for_retry`, in the same session. redo: their names; with a stage all that wait
     for it. options: of all stages, as they are to be from now on; changes: what is new in them,
     for the record. What the other stages published stays and is used; so does the checkpoint of a
-    stage that had not succeeded, which decides itself whether it fits. What a stage that is done
-    again had published stays in the store until it has succeeded anew.
+    stage that had not succeeded, which decides itself whether it fits its options. Behind a stage
+    that is done again no checkpoint is kept: it was begun on inputs that are no more. What a stage
+    that is done again had published stays in the store until it has succeeded anew.
     """
     when = when or now(session)
     stages = list(job.stages)
+    moved = _with_other_inputs(stages, redo)
     for row in stages:
         if row.name not in redo:
             continue
-        if row.state == "failed" and row.output_prefix:
-            session.add(PendingDeletion(prefix=row.output_prefix, created_at=when))
-        set_stage(session, row, "blocked", when, reason="retry", **_UNTRIED)
+        gone = [row.output_prefix] if row.state == "failed" else []
+        kept = row.checkpoint_prefix
+        if row.name in moved:
+            gone, kept = [*gone, kept], None
+        session.add_all(PendingDeletion(prefix=old, created_at=when) for old in gone if old)
+        values = {**_UNTRIED, "checkpoint_prefix": kept}
+        set_stage(session, row, "blocked", when, reason="retry", **values)
     record = {"generation": job.generation + 1, "from_stage": from_stage, "options": changes}
     set_job(
         session,

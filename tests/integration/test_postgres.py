@@ -12,10 +12,11 @@ from sqlalchemy.orm import Session
 
 from storage.claims import claim_stage
 from storage.db import Database, now
-from storage.jobs import StageSeed, delete_job, stage_id
+from storage.errors import NotFoundError
+from storage.jobs import StageSeed, create_job, delete_job, stage_id
 from storage.leases import reap_expired, succeed_stage
 from storage.queries import get_job, list_jobs
-from storage.records import append_logs, read_logs
+from storage.records import append_logs, delete_capture, get_capture, read_logs
 from storage.schema import upgrade
 from tests.factories import make_capture, make_job, states
 from tests.integration.engine import Engine
@@ -104,6 +105,25 @@ def test_pages_and_deletion(database: Database) -> None:
     with database.session_scope() as session:
         delete_job(session, ids[0])
         assert len(list_jobs(session)[0]) == 4
+
+
+def test_no_job_is_made_on_a_capture_that_was_just_deleted(database: Database) -> None:
+    with database.session_scope() as session:
+        capture = make_capture(session).id
+    with database.session_scope() as session:
+        seen = get_capture(session, capture)  # by who chooses a preset for it
+        with database.session_scope() as other:
+            delete_capture(other, capture)
+        with pytest.raises(NotFoundError):
+            create_job(
+                session,
+                capture_id=capture,
+                preset="preview",
+                preset_reason="",
+                options={},
+                stages=[StageSeed("first", ())],
+            )
+        assert seen.deleted_at is not None
 
 
 def last_state(session: Session, job: str) -> str:

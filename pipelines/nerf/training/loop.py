@@ -7,6 +7,7 @@ are used and where the files lie is left to the caller.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import time
@@ -99,13 +100,14 @@ def train(
     _check_sizes(images, cameras, train_indices)
     device = choose_device(config.device)
     supervision = _supervision(depth, len(train_indices), config, device)
-    fingerprint = _fingerprint(config, seed, len(train_indices), supervision)
+    posed = cameras.select(train_indices)
+    fingerprint = _fingerprint(config, seed, posed, supervision)
     pixels_on = pixel_device(config, device, images.nbytes)
     state = initial_state(config, len(train_indices), seed, device, pixels_on)
     if checkpoint_path is not None and checkpoint_path.exists():
         _resume(state, checkpoint_path, fingerprint)
     sampler = PixelSampler(images, train_indices, state.pixel_random.device)
-    posed = cameras.select(train_indices).to(device)
+    posed = posed.to(device)
     state.model.train()
     graphs = _gpu_steps(state, sampler, posed, config, supervision)
     preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
@@ -325,10 +327,12 @@ def _progress(
 
 
 def _fingerprint(
-    config: TrainConfig, seed: int, num_images: int, depth: DepthSupervision | None
+    config: TrainConfig, seed: int, cameras: Cameras, depth: DepthSupervision | None
 ) -> str:
     """What must be the same for a checkpoint to fit.
 
+    cameras: of the images that are learned from, in their order: a model that was begun in one
+    frame cannot go on in another.
     Limits, habits and learning rates may change in between: a run that went astray goes on with a
     lower rate.
     """
@@ -337,8 +341,23 @@ def _fingerprint(
     for name in (*free, "optimizer"):
         del values[name]
     known = 0 if depth is None else depth.maps.num_known
-    run = {"config": values, "seed": seed, "num_images": num_images, "known_depths": known}
+    run = {
+        "config": values,
+        "seed": seed,
+        "num_images": len(cameras),
+        "known_depths": known,
+        "cameras": _digest(cameras),
+    }
     return json.dumps(run, sort_keys=True)
+
+
+def _digest(cameras: Cameras) -> str:
+    """SHA-256 of poses, lenses, sizes and times."""
+    found = hashlib.sha256()
+    for name, values in sorted(vars(cameras).items()):
+        if isinstance(values, Tensor):
+            found.update(name.encode() + values.cpu().contiguous().numpy().tobytes())
+    return found.hexdigest()
 
 
 def _check_sizes(images: ImageData, cameras: Cameras, train_indices: Sequence[int]) -> None:

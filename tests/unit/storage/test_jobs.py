@@ -560,6 +560,35 @@ def test_a_retry_keeps_what_is_not_done_again(either_database: Database) -> None
         open_for_retry(session, job)
 
 
+def test_no_checkpoint_is_kept_behind_what_is_done_again(either_database: Database) -> None:
+    """Through a skipped stage, too; a stage whose inputs hold keeps its own."""
+    database = either_database
+    stages = (
+        StageSeed("first", ()),
+        StageSeed("second", ("first",), skipped=True),
+        StageSeed("third", ("second",)),
+        StageSeed("fourth", ("third",)),
+    )
+    for redo, kept in (
+        ({"third", "fourth"}, {"third": "c3/", "fourth": None}),
+        ({"first", "third", "fourth"}, {"third": None, "fourth": None}),
+    ):
+        job = new_job(database, stages)
+        succeed(database, claim(database, job, "first"))
+        held = claim(database, job, "third")
+        with database.session_scope() as session:
+            save_checkpoint(session, held, "c3/")
+            request_cancel(session, job)
+            cancel_stage(session, held)
+        with database.session_scope() as session:
+            retry_job(session, open_for_retry(session, job), redo, {}, changes={}, when=T0)
+        with database.session_scope() as session:
+            rows = {row.name: row for row in get_job(session, job).stages}
+            assert {name: rows[name].checkpoint_prefix for name in kept} == kept
+            gone = [row.prefix for row in session.query(PendingDeletion)]
+            assert gone == ([] if kept["third"] else ["c3/"])
+
+
 def test_a_retry_starts_the_counts_anew(database: Database) -> None:
     job = new_job(database)
     for at in (0.0, 1000.0, 2000.0):

@@ -8,6 +8,7 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
+from sqlalchemy.event import listen
 
 from storage.claims import claim_stage
 from storage.db import Database, now
@@ -105,6 +106,27 @@ def test_what_nobody_names_goes_after_a_day_and_all_else_stays(
         pass
     assert all(store.exists(key) for key in named)
     assert not any(store.exists(key) for key in orphans)
+
+
+def test_a_batch_costs_the_same_statements_however_many_folders_it_has(
+    database: Database, tmp_path: Path
+) -> None:
+    """They run under the lock of all writers."""
+    store = LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b"")
+    statements: list[str] = []
+    listen(database.engine, "before_cursor_execute", lambda *call: statements.append(call[2]))
+
+    def looks(num_folders: int) -> int:
+        folders = [attempt_prefix(new_id(), "first", 1, 1) for _ in range(num_folders)]
+        put(store, tmp_path, *(folder + "manifest.json" for folder in folders))
+        statements.clear()
+        assert sweep(database, store, timedelta(hours=25)) == set(folders)
+        num_looks = sum(text.startswith("SELECT") for text in statements)
+        while drain_deletions(database, store):
+            pass
+        return num_looks
+
+    assert 0 < looks(1) == looks(30)
 
 
 def test_transfers_that_were_cut_short_are_dropped(database: Database, tmp_path: Path) -> None:

@@ -119,6 +119,37 @@ def test_a_checkpoint_fits_no_run_with_other_rounds_images_or_seed(
             train(images, cameras, indices, config, seed=seed, checkpoint_path=begun)
 
 
+def test_a_checkpoint_fits_no_run_with_other_poses_lenses_or_sizes(
+    images: ImageData, cameras: Cameras, begun: Path
+) -> None:
+    """The options stay what they were: the poses were found anew, in another frame."""
+    for name, change in (
+        ("scene_from_camera", 1e-4),
+        ("focal", 0.01),
+        ("principal", 0.01),
+        ("distortion", 1e-4),
+    ):
+        values = getattr(cameras, name).clone()
+        values[1].view(-1)[-1] += change
+        others = replace(cameras, **{name: values})
+        with pytest.raises(NerfError, match="belongs to a run with other options"):
+            train(images, others, range(3), BASE, seed=0, checkpoint_path=begun)
+    last = cameras.scene_from_camera.clone()
+    last[-1, :, 3] += 1.0  # nothing is learned from this one
+    held_out = replace(cameras, scene_from_camera=last)
+    train(images, held_out, range(3), BASE, seed=0, checkpoint_path=begun)
+    smaller = cameras.resized(int(cameras.size.max()) // 2)
+    with pytest.raises(NerfError, match="belongs to a run with other options"):
+        train(
+            ImageData.empty(smaller.size.tolist(), masked=False),
+            smaller,
+            range(3),
+            BASE,
+            seed=0,
+            checkpoint_path=begun,
+        )
+
+
 @pytest.mark.parametrize("name", MAY_CHANGE)
 def test_a_run_goes_on_with_another_limit_habit_or_rate(
     images: ImageData, cameras: Cameras, begun: Path, name: str, tmp_path: Path
