@@ -68,18 +68,17 @@ class Wire:
         """Send until there is an answer. What creates something carries an Idempotency-Key, so that
         sending it again never makes a second one.
 
-        Raises ConnectionFailed after `retry_s` seconds without one.
+        Raises ConnectionFailed where there is none for `retry_s` seconds after the first failure.
         """
         patience = Patience(self.retry_s)
         while True:
-            error: httpx.TransportError | None = None
             try:
                 answer = request()
-                if not is_busy(answer) or patience.is_over:
-                    return answer
-            except httpx.TransportError as failure:
-                error = failure
-            patience.pause_or_raise(self.url, error)
+            except httpx.TransportError as error:
+                patience.pause_or_raise(self.url, error)
+                continue
+            if not is_busy(answer) or not patience.pause():
+                return answer
 
 
 def is_busy(answer: httpx.Response) -> bool:
@@ -95,27 +94,36 @@ def once_header(key: str | None) -> dict[str, str]:
 
 
 class Patience:
-    """Growing pauses, until the time is up."""
+    """Growing pauses between attempts, until the time is up.
+
+    It counts from the first failure: an upload may take much longer than a service is away.
+    """
 
     def __init__(self, seconds: float) -> None:
-        self._deadline = time.monotonic() + seconds
-        self._pause = PAUSE_FIRST_S
+        self._seconds = seconds
+        self._deadline: float | None = None
+        self._pause_s = PAUSE_FIRST_S
 
-    @property
-    def is_over(self) -> bool:
-        """Whether there is no time left."""
-        return time.monotonic() >= self._deadline
+    def pause(self) -> bool:
+        """An attempt failed: wait a little. False, at once, where the time is up."""
+        moment = time.monotonic()
+        if self._deadline is None:
+            self._deadline = moment + self._seconds
+        left_s = self._deadline - moment
+        if left_s <= 0.0:
+            return False
+        time.sleep(min(self._pause_s, left_s))
+        self._pause_s = min(self._pause_s * 1.6, PAUSE_MOST_S)
+        return True
 
-    def pause_or_raise(self, url: str, error: Exception | None) -> None:
-        """Wait a little; raises ConnectionFailed once the time is up."""
-        if self.is_over:
+    def pause_or_raise(self, url: str, error: Exception) -> None:
+        """The same; raises ConnectionFailed where the time is up."""
+        if not self.pause():
             raise unreachable(url, error) from error
-        time.sleep(min(self._pause, max(self._deadline - time.monotonic(), 0.0)))
-        self._pause = min(self._pause * 1.6, PAUSE_MOST_S)
 
 
-def unreachable(url: str, error: Exception | None) -> ConnectionFailed:
-    why = f" ({error})" if error is not None and str(error) else ""
+def unreachable(url: str, error: Exception) -> ConnectionFailed:
+    why = f" ({error})" if str(error) else ""
     return ConnectionFailed(
         f"The service at {url} cannot be reached{why}.", "Check that it runs: `make up` starts one."
     )

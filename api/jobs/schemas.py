@@ -95,7 +95,7 @@ class RetryRequest(BaseModel):
     from_stage: StageName | None = Field(
         None, description="Begin with this stage even where its result would hold."
     )
-    options: dict[str, Any] = Field(
+    options: JsonObject = Field(
         default_factory=dict, description="{stage: {option: value}}, laid over the job's options."
     )
 

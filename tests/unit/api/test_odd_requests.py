@@ -163,6 +163,20 @@ def test_bodies_that_no_job_can_be_made_of_are_refused(odd: Service) -> None:
         assert answer.status_code in (400, 422), content[:20]
 
 
+def test_bodies_that_no_retry_can_be_made_of_are_refused(odd: Service) -> None:
+    job = odd.job(preset="preview")["id"]
+    odd.http.post(f"/v1/jobs/{job}/cancel")
+    wishes = [{"options": body["options"]} for body in BODIES if "options" in body]
+    for body in (*wishes, {"from_stage": "\ud800"}, {"from_stage": "\0"}, {"\ud800": 1}):
+        answer = odd.http.post(
+            f"/v1/jobs/{job}/retry",
+            content=json.dumps(body),
+            headers={"Content-Type": "application/json"},
+        )
+        problem(answer, 422, answer.json()["code"])
+    assert odd.http.get(f"/v1/jobs/{job}").json()["state"] == "cancelled"
+
+
 def test_odd_forms_are_refused(odd: Service) -> None:
     for kind in (
         *(

@@ -208,6 +208,52 @@ def test_download_of_an_unknown_name_says_what_there_is(
         client.download(finished, tmp_path / "out", names=["mesh.nothing"])
 
 
+class _Slow(BaseHTTPRequestHandler):
+    """Breaks the first upload off, late; is busy when it is sent again."""
+
+    uploads: list[int]
+
+    def do_POST(self) -> None:
+        cls = type(self)
+        cls.uploads.append(len(self.rfile.read(int(self.headers["Content-Length"]))))
+        self.close_connection = True
+        if len(cls.uploads) == 1:
+            time.sleep(0.4)
+            return
+        body = b'{"code": "busy", "detail": "Not now."}'
+        self.send_response(503)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *args: Any) -> None:
+        del args
+
+
+@pytest.mark.parametrize(("retry_s", "most"), [(0.3, 5), (0.0, 1)])
+def test_an_upload_that_took_longer_than_one_waits_is_sent_again_all_the_same(
+    archive: Path, retry_s: float, most: int
+) -> None:
+    """It broke off after 0.4 s; then the service is busy for good."""
+    uploads: list[int] = []
+    handler = type("Handler", (_Slow,), {"uploads": uploads})
+    server = HTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        url = f"http://127.0.0.1:{server.server_port}"
+        with (
+            Client(url, KEY, retry_s=retry_s) as client,
+            pytest.raises((ApiProblem, ConnectionFailed)) as caught,
+        ):
+            client.upload(archive)
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert isinstance(caught.value, ApiProblem if retry_s else ConnectionFailed)
+    assert (2 if retry_s else 1) <= len(uploads) <= most
+    assert len(set(uploads)) == 1, "each time whole"
+
+
 class _Unreliable(BaseHTTPRequestHandler):
     """Breaks the connection after some bytes of each answer; `mode` says how it treats ranges."""
 
