@@ -64,7 +64,8 @@ def none_there(file: str, paths: Sequence[str]) -> CaptureError:
     return missing(
         f"{file} lists {len(wanted)} pictures, and none of them is in the archive: "
         f"{some_of(wanted)}.",
-        hint="Pack the pictures together with that file, under the names that it gives them.",
+        hint="Pack the pictures together with that file, under the names that it gives them; or "
+        "send the pictures alone to have their poses found.",
     )
 
 

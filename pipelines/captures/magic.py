@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-HEAD_BYTES = 64
-"""How many of a file's first bytes the functions here want."""
+HEAD_BYTES = 256
+"""How many of a file's first bytes are looked at: 64 tell what it is, and in a text that many hold
+its first lines, by which importers tell their formats from others of the same name."""
 
 _HEIF_BRANDS = frozenset(
     {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"avis"}

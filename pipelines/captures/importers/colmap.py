@@ -38,9 +38,17 @@ from pipelines.errors import CaptureError
 from pipelines.scene.natural_order import natural_key
 
 _SUFFIXES = (".bin", ".txt")
-_TEXT = re.compile(rb"\s*(#|[0-9]+\s+[A-Z_]+\s+[0-9]+\s)")
-"""How cameras.txt starts: with a comment, or with a camera."""
-_MOST_CAMERAS = 1 << 24
+_COMMENTS = rb"(\xef\xbb\xbf)?(\s*#[^\n]*\n)*\s*"
+_TEXTS = {
+    "cameras": re.compile(
+        rb"\s*#\s*(Camera list|CAMERA_ID)|" + _COMMENTS + rb"[0-9]+\s+[A-Z_]+\s+[0-9]+\s"
+    ),
+    "images": re.compile(
+        rb"\s*#\s*(Image list|IMAGE_ID)|" + _COMMENTS + rb"[0-9]+(\s+[-+.0-9a-zA-Z]+){7}\s+[0-9]+\s"
+    ),
+}
+"""How the texts start: with COLMAP's comments, or with others or none and a camera or an image."""
+_MOST_LISTED = 1 << 24
 _FILES = ("cameras", "images", "points3D", "frames", "rigs")
 
 Read = TypeVar("Read")
@@ -52,7 +60,7 @@ def claims(listing: Listing) -> Claim | None:
         (folder.count("/"), folder, suffix)
         for suffix in _SUFFIXES
         for folder in _folders(listing.heads, suffix)
-        if _is_list(listing.heads[f"{folder}cameras{suffix}"], suffix)
+        if all(_is_list(listing.heads, folder, what, suffix) for what in _TEXTS)
     ]
     if not found:
         return None
@@ -72,11 +80,12 @@ def _folders(names: Collection[str], suffix: str) -> list[str]:
     return sorted(folders, key=lambda folder: (folder.count("/"), folder))
 
 
-def _is_list(head: bytes, suffix: str) -> bool:
-    """Whether a file of cameras starts as COLMAP writes it."""
+def _is_list(heads: Mapping[str, bytes], folder: str, what: str, suffix: str) -> bool:
+    """Whether a file of cameras or images starts as COLMAP writes it."""
+    head = heads[f"{folder}{what}{suffix}"]
     if suffix == ".txt":
-        return _TEXT.match(head) is not None
-    return len(head) >= 8 and int.from_bytes(head[:8], "little") < _MOST_CAMERAS
+        return _TEXTS[what].match(head) is not None
+    return len(head) >= 8 and int.from_bytes(head[:8], "little") < _MOST_LISTED
 
 
 @dataclass(frozen=True)

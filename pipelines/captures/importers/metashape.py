@@ -41,7 +41,8 @@ from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.natural_order import natural_key
 
 _HEAD = re.compile(
-    rb"(\xef\xbb\xbf)?\s*(<\?xml[^>]*\?>\s*)?(<document\s+version=\"[0-9.]|<!DOCTYPE\s+document)"
+    rb"(\xef\xbb\xbf)?\s*(<\?xml[^>]*\?>\s*)?"
+    rb"(<document\s+version=\"[0-9.]+\"[^>]*>\s*<chunk[\s/>]|<!DOCTYPE\s+document)"
 )
 _MODELS = {"frame": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 _TERMS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

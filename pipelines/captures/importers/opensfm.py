@@ -20,14 +20,15 @@ Source: OpenSfM, opensfm/io.py and src/geometry; OpenDroneMap, opendm/shots.py.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, Rows, SparsePoints
-from pipelines.captures.importer import Claim, Importer, Listing
+from pipelines.captures.importer import Claim, Importer, Listing, folders_above
 from pipelines.captures.listed_pictures import match_pictures
 from pipelines.captures.parsing import (
     each_frame,
@@ -47,6 +48,8 @@ from pipelines.scene.natural_order import natural_key
 _FILE = "reconstruction.json"
 _SHOTS = "shots.geojson"
 _CAMERAS = "cameras.json"
+_LIST = re.compile(rb"(\xef\xbb\xbf)?\s*\[\s*\{")
+"""How a list of reconstructions starts."""
 _MOST_BYTES = 256 << 20
 _MOST_DOP = 100.0
 """Dilution of precision above which a shot's GPS is none: OpenSfM writes 999999 where there is."""
@@ -69,13 +72,19 @@ Values = Mapping[str, Any]
 def claims(listing: Listing) -> Claim | None:
     """An archive with a list in `reconstruction.json`, or with OpenDroneMap's two files."""
     for root in listing.roots_of(_FILE):
-        if listing.heads[root + _FILE].lstrip().startswith(b"["):
+        if _LIST.match(listing.heads[root + _FILE]):
             return Claim(root, _FILE)
-    cameras = listing.roots_of(_CAMERAS)
     for root in listing.roots_of(_SHOTS):
-        if cameras and b"FeatureCollection" in listing.heads[root + _SHOTS]:
+        name = root + _SHOTS
+        if b"FeatureCollection" in listing.heads[name] and _cameras_above(name, listing.heads):
             return Claim(root, _SHOTS)
     return None
+
+
+def _cameras_above(shots: str, names: Collection[str]) -> str | None:
+    """OpenDroneMap's file of cameras: beside that of shots, or in the nearest folder above."""
+    found = [folder + _CAMERAS for folder in folders_above(shots) if folder + _CAMERAS in names]
+    return found[-1] if found else None
 
 
 def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
@@ -183,10 +192,9 @@ def _has_gps(shot: Any) -> bool:
 
 def _shots(archive: CaptureArchive, name: str) -> list[_Model]:
     """The one model of OpenDroneMap's files, in map coordinates, metres."""
-    cameras_file = min(
-        (item for item in archive.names if item.rpartition("/")[2] == _CAMERAS),
-        key=lambda item: (item.count("/"), item),
-    )
+    cameras_file = _cameras_above(name, archive.names)
+    if cameras_file is None:
+        raise missing(f"There is no {_CAMERAS} beside {shown(name)}, or in a folder above.")
     cameras = archive.read_json(cameras_file)
     collection = archive.read_json(name)
     features = collection.get("features") if isinstance(collection, dict) else None

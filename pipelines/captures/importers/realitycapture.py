@@ -29,7 +29,7 @@ from pipelines.captures.unpack import CaptureArchive
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.natural_order import natural_key
 
-_HEAD = re.compile(rb"(\xef\xbb\xbf)?(#cameras[^\r\n]*[\r\n]+)?#name\s*,", re.IGNORECASE)
+_HEAD = re.compile(rb"(\xef\xbb\xbf)?(#cameras[^\r\n]*[\r\n]+)?#name\s*,([^\r\n]*)", re.IGNORECASE)
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _FILM_MM = 36.0
@@ -40,12 +40,20 @@ def claims(listing: Listing) -> Claim | None:
     found = [
         (name.count("/"), name)
         for name, head in listing.heads.items()
-        if listing.is_archive and _HEAD.match(head)
+        if listing.is_archive and _is_table(head)
     ]
     if not found:
         return None
     folder, _, file = min(found)[1].rpartition("/")
     return Claim(f"{folder}/" if folder else "", file)
+
+
+def _is_table(head: bytes) -> bool:
+    """Whether a file starts with names of columns that say where cameras are; the table itself may
+    still lack others."""
+    found = _HEAD.match(head)
+    columns = {word.strip().lower() for word in re.split(rb"[,;\t]", found[3])} if found else set()
+    return columns >= {b"x", b"y"} and not columns.isdisjoint({b"z", b"alt"})
 
 
 @dataclass(frozen=True)

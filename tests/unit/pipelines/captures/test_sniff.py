@@ -115,6 +115,51 @@ def test_archives_are_told_apart_with_and_without_a_top_folder(
     assert sniff(path, "capture.bin").kind == kind
 
 
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"cameras.txt": "# my cameras\n", "images.txt": "list of images\n"},
+        {
+            "cameras.txt": "# my cameras\n1 OPENCV 64 48 60 60 32 24\n",
+            "images.txt": "# best\n1 a\n",
+        },
+        {"cameras.bin": bytes(8), "images.bin": b"\xff" * 40},
+        {"a.xml": '<document version="3.0"><page>'},
+        {"doc.xml": '<?xml version="1.0"?>\n<document version="1.2.0">\n  <chunks next_id="1">'},
+        {"notes.csv": "#name,size\nIMG_1.jpg,7\n"},
+        {"notes.csv": "#name,x,y,label\nIMG_1.jpg,7,8,nose\n"},
+        {"reconstruction.json": "[1,2]"},
+        {"reconstruction.json": "[]"},
+        {"poses.txt": "1 2 3 4\n", **{f"results/{n}.png": picture(kind="PNG") for n in range(3)}},
+        {"a/shots.geojson": '{"type": "FeatureCollection"}', "b/cameras.json": "{}"},
+    ],
+)
+def test_photos_beside_files_of_other_things_stay_photos(
+    tmp_path: Path, files: dict[str, bytes | str]
+) -> None:
+    photos = {f"IMG_{n}.jpg": picture(seed=n) for n in range(3)}
+    assert sniff(write_zip(tmp_path / "c", photos | files), "c.zip").kind == "images"
+
+
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [
+        ("colmap", {"cameras.txt": "#\n1 PINHOLE 6 4 5 5 3 2", "images.txt": f"1 {'0 ' * 7} 1 a"}),
+        ("colmap", {"cameras.txt": "# CAMERA_ID", "images.txt": "# Image list with two lines"}),
+        ("metashape", {"a.xml": '<document version="2.1.0">\r\n  <chunk label="1">'}),
+        ("realitycapture", {"a.csv": "#name,alt,x,y,heading,pitch,roll,f"}),
+        ("opensfm", {"reconstruction.json": '[\n    {\n        "cameras"'}),
+        ("opensfm", {"p/odm/shots.geojson": '{"type": "FeatureCollection"', "p/cameras.json": ""}),
+        ("rgbd", {"poses.txt": "1 2 3", "results/depth1.png": picture(kind="PNG")}),
+    ],
+)
+def test_formats_are_told_by_their_first_lines(
+    tmp_path: Path, kind: str, files: dict[str, bytes | str]
+) -> None:
+    photos = {f"results/{n}.jpg": picture(seed=n) for n in range(3)}
+    assert sniff(write_zip(tmp_path / "c", photos | files), "c.zip").kind == kind
+
+
 def test_r3d_file_is_a_record3d_capture(tmp_path: Path) -> None:
     path = write_zip(
         tmp_path / "c", {"metadata": "{}", "rgbd/0.jpg": picture(), "rgbd/0.depth": ""}
@@ -286,7 +331,7 @@ def test_sniffing_loads_no_library_beyond_the_standard_one() -> None:
 @pytest.mark.parametrize(
     ("name", "head", "kind"),
     [
-        ("cameras.xml", b'<?xml version="1.0"?>\n<document version="1.5.0">', "metashape"),
+        ("cameras.xml", b'<?xml version="1.0"?>\n<document version="1.5.0"><chunk>', "metashape"),
         ("export.csv", b"#name,x,y,alt,heading,pitch,roll,f", "realitycapture"),
         ("model.nvm", b"NVM_V3 \n\n11\n", "visualsfm"),
         ("reconstruction.json", b"[{", "opensfm"),

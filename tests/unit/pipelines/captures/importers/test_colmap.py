@@ -220,6 +220,7 @@ def test_a_model_without_pictures_says_which_it_wants(tmp_path: Path) -> None:
     error = failure(tmp_path, colmap_files(TRUTH))
     assert error.code == "poses_missing"
     assert "lists 10 pictures" in error.message
+    assert "send the pictures alone" in error.hint
     assert "IMG_9.jpg" in error.message
 
 

@@ -276,7 +276,7 @@ def bomb(declared: str, used: str) -> str:
         (bomb('<!ENTITY a SYSTEM "http://127.0.0.1:9/x">', "&a;"), "document type"),
         (bomb('<!ENTITY % p SYSTEM "file:///etc/passwd"> %p;', ""), "document type"),
         (metashape_xml(TRUTH).replace("Chunk 1", "&a;"), "no readable XML"),
-        (HEAD + "<a>" * 100, "too deep"),
+        (HEAD + "<chunk>" + "<a>" * 100, "too deep"),
         (HEAD + "<chunk>", "no readable XML"),
         (HEAD + "<chunk/></document>", "has no cameras"),
         (HEAD + "<chunk><cameras/></chunk></document>", "none is both aligned and on"),
