@@ -51,6 +51,8 @@ MODELS = {
 DEFAULT_DEPTH_UNIT = 0.001
 """nerfstudio's `depth_unit_scale_factor`: millimetres in a world of metres."""
 
+LARGEST = 1e300
+"""JSON has whole numbers that no float can hold; what is larger than this is no number."""
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 Values = Mapping[str, Any]
@@ -173,7 +175,7 @@ def told_of_motion(file: str, frames: Sequence[Any]) -> tuple[list[str], dict[st
     times = {
         value
         for value in values
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
     }
     if len(times) < 2:
         return [], {}

@@ -129,7 +129,7 @@ def _rows(data: bytes, file: str) -> list[tuple[float, ...]]:
     what = f'"{shown(file)}"'
     try:
         form, fortran, shape, start = _header(data)
-    except (ValueError, SyntaxError, KeyError, TypeError, struct.error, RecursionError) as error:
+    except (ValueError, SyntaxError, LookupError, TypeError, struct.error, RecursionError) as error:
         raise broken(f"{what} is no array that is read.") from error
     if len(shape) != 2 or shape[1] != _COLUMNS or fortran:
         raise broken(f"{what} is an array of {shape}, not of rows of {_COLUMNS} numbers.")

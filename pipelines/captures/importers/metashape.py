@@ -52,6 +52,7 @@ _SEMI_AXES_M = (6_378_137.0, 6_378_137.0, 6_356_752.314)
 _EARTH_M = (6.2e6, 6.5e6)
 """How far from the earth's middle its surface is."""
 _TOLD_PX = 0.5
+_MOST_PIXELS = 1e9
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -410,8 +411,10 @@ def _lens(sensor: Element, what: str) -> _Found:
             element = calibration.find(name)
             if element is not None:
                 (terms[name],) = _numbers(element, 1, f"{name} of the sensor of {what}")
-    if terms["f"] == 0.0:
-        raise malformed(f"The sensor of {what} has no focal length f.")
+    if not (0 < width < _MOST_PIXELS and 0 < height < _MOST_PIXELS):
+        raise malformed(f"The resolution of the sensor of {what} is none.")
+    if not 1.0 <= abs(terms["f"]) < _MOST_PIXELS:
+        raise malformed(f"The sensor of {what} has no focal length f in pixels.")
     lens = Intrinsics(
         width=width,
         height=height,

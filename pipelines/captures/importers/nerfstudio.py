@@ -24,6 +24,7 @@ from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.named_files import NamedFiles
 from pipelines.captures.parsing import malformed, number, numbers, z_up_from_y_up
 from pipelines.captures.transforms_json import (
+    LARGEST,
     Values,
     read_frames,
     read_transforms,
@@ -86,7 +87,7 @@ def _centred(values: Any) -> Any:
     moved = {
         key: values[key] + _PIXEL_CENTRE
         for key in ("cx", "cy")
-        if isinstance(values.get(key), float | int)
+        if isinstance(values.get(key), float | int) and abs(values[key]) < LARGEST
     }
     return {**values, **moved}
 

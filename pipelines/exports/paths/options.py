@@ -18,7 +18,11 @@ from pipelines.option_models import StageOptions
 _World = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Fov = Annotated[float, Field(ge=1.0, le=150.0)]
 _Point = tuple[_World, _World, _World]
+_Turn = Annotated[float, Field(ge=-1e3, le=1e3)]
 _NOT_RIGID = 0.01
+_SAME_PLACE = 1e-9
+_SHORTEST_S = 1e-3
+"""Of a way between two keyframes: less is no frame at any rate, and tiny numbers overflow."""
 MAX_FRAMES = 20_000
 MAX_SIDE_PX = 8192
 
@@ -59,7 +63,7 @@ class Keyframe(StageOptions):
 
     position: _Point = Field(description="Where the camera is. Unit: the world's.")
     look_at: _Point | None = Field(None, description="What is in the middle of the picture.")
-    rotation: tuple[float, float, float, float] | None = Field(
+    rotation: tuple[_Turn, _Turn, _Turn, _Turn] | None = Field(
         None,
         description="In place of look_at: world_from_camera as a quaternion w, x, y, z; a camera "
         "looks along its -Z and +Y is up.",
@@ -69,13 +73,13 @@ class Keyframe(StageOptions):
     )
     seconds: float | None = Field(
         None,
-        gt=0,
+        ge=_SHORTEST_S,
         le=3600,
         description="How long it takes to come here from the one before.",
     )
     speed: float | None = Field(
         None,
-        gt=0,
+        ge=1e-6,
         le=1e6,
         description="In place of seconds: how fast. Unit: the world's per second.",
     )
@@ -86,7 +90,7 @@ class Keyframe(StageOptions):
             raise ValueError("must have one of look_at and rotation")
         if self.rotation is not None and math.hypot(*self.rotation) < 1e-6:
             raise ValueError("rotation must not be 0")
-        if self.look_at == self.position:
+        if self.look_at and math.dist(self.look_at, self.position) <= _SAME_PLACE:
             raise ValueError("look_at must not be the position itself")
         if self.seconds is not None and self.speed is not None:
             raise ValueError("must not have both seconds and speed")
@@ -146,7 +150,7 @@ class NerfstudioKeyframe(_Nerfstudio):
     matrix: _Matrix
     fov: _Fov
     override_transition_enabled: bool = False
-    override_transition_sec: float | None = Field(None, gt=0, le=3600)
+    override_transition_sec: float | None = Field(None, ge=_SHORTEST_S, le=3600)
 
 
 class NerfstudioPath(_Nerfstudio):
@@ -158,7 +162,7 @@ class NerfstudioPath(_Nerfstudio):
     fps: float = Field(ge=1, le=120)
     is_cycle: bool = False
     smoothness_value: float = Field(0.0, ge=0, le=1)
-    default_transition_sec: float = Field(2.0, gt=0, le=3600)
+    default_transition_sec: float = Field(2.0, ge=_SHORTEST_S, le=3600)
     camera_path: list[NerfstudioPose] = Field(default_factory=list, max_length=MAX_FRAMES)
     keyframes: list[NerfstudioKeyframe] = Field(default_factory=list, max_length=MAX_FRAMES)
 

@@ -160,7 +160,9 @@ def test_one_moment_is_no_motion(tmp_path: Path) -> None:
     assert "motion" not in cameras(ctx).notes
 
 
-@pytest.mark.parametrize("time", [None, "later", float("nan"), True, [0.5]])
+@pytest.mark.parametrize(
+    "time", [None, "later", float("nan"), True, [0.5], pytest.param(10**400, id="10**400")]
+)
 def test_a_time_that_is_none_costs_its_frame(tmp_path: Path, time: Any) -> None:
     summary, _ = ingest(tmp_path, with_times([n / 10 for n in range(10)] + [time]))
     assert summary["num_posed"] in (10, 11)

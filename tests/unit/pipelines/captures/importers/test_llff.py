@@ -77,6 +77,7 @@ MIRRORED[6, 1] = -1.0
         (WHOLE + b"\0", "poses_malformed", "says that it has 5 rows"),
         (WHOLE[:40], "poses_malformed", "no array"),
         (WHOLE[:8], "poses_malformed", "no array"),
+        (WHOLE[:6], "poses_malformed", "no array"),
         (npy(llff_table(0)), "poses_missing", "no rows"),
         (npy(llff_table(4)), "poses_malformed", "poses of 4 pictures, and 5 pictures"),
         (npy(llff_table(6)), "poses_malformed", "poses of 6 pictures"),

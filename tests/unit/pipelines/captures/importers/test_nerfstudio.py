@@ -473,9 +473,9 @@ def test_nerfcapture_is_known_by_its_key(tmp_path: Path) -> None:
     file = cameras(ctx)
     assert [image.world_from_camera[1][3] for image in file.images] == [0, 1, 2, 3]
     assert (file.cameras[0].cx, file.cameras[0].cy) == (31.5, 23.5)
-    for key in ("cx", "cy"):
-        broken: dict[str, Any] = {"depth_integer_scale": 1, key: "x"}
-        code = code_of(tmp_path / key, instant_ngp(**broken))
+    for key, value in (("cx", "x"), ("cy", "x"), ("cx", 10**400)):
+        broken: dict[str, Any] = {"depth_integer_scale": 1, key: value}
+        code = code_of(tmp_path / key / str(value)[:3], instant_ngp(**broken))
         assert code == "poses_malformed"
 
 

@@ -74,6 +74,7 @@ def test_without_pictures_it_says_which_it_wants(tmp_path: Path) -> None:
         ("61.5", "", "poses_malformed", "Line 4"),
         (" 0 \n", " \n", "poses_malformed", "Line 4"),
         (" 0.0 0 \n", " -9.0 0 \n", "poses_malformed", "folds the picture over"),
+        (" 0.0 0 \n", " nan 0 \n", "poses_malformed", "Line 4"),
     ],
 )
 def test_faults_are_refused_by_name(
@@ -84,6 +85,15 @@ def test_faults_are_refused_by_name(
     error = failure(tmp_path, PICTURES | {"a.nvm": text.replace(old, new).encode()})
     assert error.code == code
     assert words in error.message
+
+
+@pytest.mark.parametrize("focal", [1e-200, 1e-320, 1e-60, 0.01])
+@pytest.mark.parametrize("r", [0.1, -0.1, 1e11])
+def test_a_focal_length_that_no_lens_has_is_refused(tmp_path: Path, focal: float, r: float) -> None:
+    text = nvm_text(TRUTH, r=r).replace("61.5", str(focal))
+    error = failure(tmp_path, PICTURES | {"a.nvm": text.encode()})
+    assert error.code == "poses_malformed"
+    assert "focal lengths" in error.message
 
 
 def test_reduced_pictures_are_refused_as_the_file_has_no_sizes(tmp_path: Path) -> None:

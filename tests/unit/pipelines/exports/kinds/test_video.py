@@ -187,6 +187,11 @@ def test_keyframes_without_all_times_or_angles_are_refused() -> None:
         ([place, {**there, "fov_deg": 50}], "for every keyframe, or for none"),
         ([place, {**there, "seconds": 2, "speed": 1}], "both seconds and speed"),
         ([place, {**there, "seconds": 3000}], "72000 frames"),
+        ([place, {**there, "seconds": 1e-300}], "or equal to 0.001"),
+        ([place, {**there, "speed": 1e-320}], "or equal to 0.000001"),
+        ([place, {**there, "look_at": [1e-320, 1, 0]}], "not be the position itself"),
+        ([place, {"position": [0, 1, 0], "rotation": [float("inf"), 0, 0, 1]}], "or equal to 1000"),
+        ([place, {"position": [0, 1, 0], "rotation": [1, 0, -1e200, 0]}], "or equal to -1000"),
     ):
         with pytest.raises(OptionsError) as caught:
             resolve_options("preview", {"video": {"path": "keyframes", "keyframes": frames}})

@@ -199,6 +199,7 @@ def test_its_keyframes_are_expanded_where_it_has_no_frames() -> None:
         ({"camera_path": [{"camera_to_world": [float("nan")] * 16, "fov": 9}]}, "finite"),
         ({"camera_path": [{"camera_to_world": "[1, 2", "fov": 9}]}, "no list in JSON"),
         ({"fps": 0}, "greater than or equal to 1"),
+        ({"default_transition_sec": 1e-300}, "greater than or equal to 0.001"),
     ],
 )
 def test_files_that_cannot_be_flown_are_refused(wrong: dict[str, Any], told: str) -> None:
