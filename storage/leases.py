@@ -81,9 +81,13 @@ def heartbeat(
     progress: float | None = None,
     message: str | None = None,
     eta_s: float | None = None,
+    moved: bool = True,
     when: datetime | None = None,
 ) -> HeartbeatReply:
-    """Extend the lease and record progress (where given, with its message and seconds left)."""
+    """Extend the lease and record progress (where given, with its message and seconds left).
+
+    moved: whether the stage got on, or only the seconds left are new.
+    """
     when = when or now(session)
     values: dict[str, Any] = {
         "lease_until": when + timedelta(seconds=lease_s),
@@ -91,7 +95,7 @@ def heartbeat(
     }
     if progress is not None:
         values |= {"progress": progress, "message": message or "", "eta_s": eta_s}
-        values["progress_at"] = when
+        values |= {"progress_at": when} if moved else {}
     statement = (
         update(StageRow)
         .where(

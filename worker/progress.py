@@ -38,6 +38,7 @@ class LeaseKeeper:
         self._settings = settings
         self._lock = threading.Lock()
         self._progress: tuple[float, str, float | None] | None = None
+        self._moved = False  # since it was last written
         self._lines: list[str] = []
         self._stopped = threading.Event()
         self._beat_at = self._looked_at = time.monotonic()
@@ -56,10 +57,16 @@ class LeaseKeeper:
         self._stopped.set()
         self._thread.join()
 
-    def report(self, fraction: float, message: str, eta_s: float | None) -> None:
-        """Note progress; it is written within a second or so."""
+    def report(
+        self, fraction: float, message: str, eta_s: float | None, *, moved: bool = True
+    ) -> None:
+        """Note progress; it is written within a second or so.
+
+        moved: False where only the seconds left are new: they are written with the next heartbeat.
+        """
         with self._lock:
             self._progress = (fraction, message, eta_s)
+            self._moved |= moved
 
     def log(self, line: str) -> None:
         """Note a log line; it is written within a second or so."""
@@ -96,7 +103,7 @@ class LeaseKeeper:
 
     def _step(self, moment: float) -> None:
         since_beat = moment - self._beat_at
-        reporting = self._progress is not None and since_beat >= PROGRESS_STEP_S
+        reporting = self._moved and since_beat >= PROGRESS_STEP_S
         if since_beat >= self._settings.heartbeat_s or reporting:
             self._beat(moment)
         elif moment - self._looked_at >= self._settings.cancel_poll_s:
@@ -109,16 +116,24 @@ class LeaseKeeper:
     def _beat(self, moment: float) -> None:
         with self._lock:
             progress, self._progress = self._progress, None
+            moved, self._moved = self._moved, False
         fraction, message, eta_s = progress or (None, None, None)
-        with self._database.session_scope() as session:
-            reply = heartbeat(
-                session,
-                self._claim,
-                self._settings.lease_s,
-                progress=fraction,
-                message=message,
-                eta_s=eta_s,
-            )
+        try:
+            with self._database.session_scope() as session:
+                reply = heartbeat(
+                    session,
+                    self._claim,
+                    self._settings.lease_s,
+                    progress=fraction,
+                    message=message,
+                    eta_s=eta_s,
+                    moved=moved,
+                )
+        except SQLAlchemyError:
+            with self._lock:
+                self._progress = self._progress or progress
+                self._moved |= moved
+            raise
         self._beat_at = self._looked_at = moment
         if reply.lost:
             self.lost.set()

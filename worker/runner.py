@@ -11,7 +11,6 @@ import importlib
 import logging
 import os
 import queue
-import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +38,7 @@ from storage.objects import ObjectStore
 from storage.queries import StageWork, stage_work
 from storage.runs import RunEnd
 from worker.checkpoints import CheckpointUploader, Snapshot
+from worker.disk import free_bytes
 from worker.failures import publish_failure
 from worker.outcomes import (
     StageCrashedError,
@@ -58,6 +58,7 @@ from worker.settings import WorkerSettings
 from worker.transfer import (
     fetch_capture,
     fetch_inputs,
+    missing_bytes,
     restore_checkpoint,
     upload_folder,
     write_job_file,
@@ -120,14 +121,18 @@ class Pulse:
         """There was a sign."""
         self._silent_s = 0.0
 
-    def notice(self, message: Mapping[str, Any]) -> None:
-        """A message of the stage process came; the same progress as before is no sign."""
+    def notice(self, message: Mapping[str, Any]) -> bool:
+        """A message of the stage process came. Whether it is a sign: progress said before is not.
+
+        Seconds left that run down are none either.
+        """
         if message["type"] == "progress":
             said = (message["fraction"], message["message"])
             if said == self._said:
-                return
+                return False
             self._said = said
         self.beat()
+        return True
 
     def silent_s(self, moment: float | None = None) -> float:
         """Seconds without a sign so far. To be asked often."""
@@ -237,7 +242,7 @@ class Runner:
             work = stage_work(session, claim)
         workspace = Workspace(self._work_dir / claim.job_id)
         end_predecessor(workspace.root, stage.name, claim.token)
-        self._check_disk(stage, work)
+        self._check_disk(stage, work, workspace)
         write_job_file(workspace, work)
         if self._is_near_the_capture(stage):
             fetch_capture(self._store, workspace, work, guard)
@@ -262,15 +267,12 @@ class Runner:
         laps.end("store_s")
         return {**manifest, "timings": {**manifest["timings"], **laps.seconds}}
 
-    def _check_disk(self, stage: Stage, work: StageWork) -> None:
-        """Refuse to begin what cannot end: its inputs, and some room to write, must fit."""
-        inputs = [work.inputs[name].manifest for name in stage.reads if name in work.inputs]
-        needed = sum(item["bytes"] for found in inputs for item in found.get("files", []))
+    def _check_disk(self, stage: Stage, work: StageWork, workspace: Workspace) -> None:
+        """Refuse to begin what cannot end: what it still lacks, and room to write, must fit."""
+        wants_capture = self._is_near_the_capture(stage)
+        needed = missing_bytes(workspace, stage.reads, work, wants_capture=wants_capture)
         needed += self._settings.min_free_bytes
-        if self._is_near_the_capture(stage):
-            needed += work.capture_bytes
-        self._work_dir.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(self._work_dir).free
+        free = free_bytes(self._work_dir)
         if free < needed:
             raise disk_too_small(stage.name, free, needed)
 
@@ -358,17 +360,15 @@ class Runner:
                 process.kill()
                 raise time_limit_of(stage.name, stage.time_limit_s)
             self._peak_bytes = process.peak_bytes() or self._peak_bytes
-            try:
-                message = process.messages.get(timeout=MESSAGE_STEP_S)
-            except queue.Empty:
-                if pulse.silent_s() > stage.stall_s:
-                    process.kill()
-                    raise stalled_of(stage.name, stage.stall_s) from None
-                continue
-            pulse.notice(message)
-            kind = message["type"]
+            message, is_sign = self._next_message(process, pulse)
+            if pulse.silent_s() > stage.stall_s:
+                process.kill()
+                raise stalled_of(stage.name, stage.stall_s)
+            kind = message.get("type")
             if kind == "progress":
-                keeper.report(message["fraction"], message["message"], message["eta_s"])
+                keeper.report(
+                    message["fraction"], message["message"], message["eta_s"], moved=is_sign
+                )
             elif kind == "checkpoint":
                 uploader.offer(Snapshot(Path(message["path"]), message["files"]))
             elif kind == "begun":
@@ -385,6 +385,18 @@ class Runner:
                 raise StopRunError("cancel")
             elif kind == "exit":
                 raise crash_of(stage.name, *process.exit_reason())
+
+    @staticmethod
+    def _next_message(process: StageProcess, pulse: Pulse) -> tuple[dict[str, Any], bool]:
+        """What the process says next, and whether it is a sign of life; empty where it is silent.
+
+        It may repeat itself without a pause and get on no more: that is silence, too.
+        """
+        try:
+            message: dict[str, Any] = process.messages.get(timeout=MESSAGE_STEP_S)
+        except queue.Empty:
+            return {}, False
+        return message, pulse.notice(message)
 
     def _stop(self, process: StageProcess, reason: str, uploader: CheckpointUploader) -> None:
         """Ask the stage to stop; kill it, and what it started, where it does not in time.

@@ -38,6 +38,7 @@ from storage.records import (
 )
 from storage.settings import StorageSettings
 from worker.compiling import KernelCompiler
+from worker.disk import DiskWatch
 from worker.housekeeping import Housekeeping
 from worker.locks import is_process
 from worker.runner import Runner, load_registry
@@ -120,6 +121,7 @@ class WorkerRuntime:
         self._gpu = threading.Lock()  # held by the slot whose stage runs on the GPU
         self._stages = load_registry(registry).STAGES
         self._compiler = KernelCompiler()
+        self._disk = DiskWatch(storage.work_dir, settings.min_free_bytes)
         self._runners = [
             Runner(
                 self._database,
@@ -256,7 +258,7 @@ class WorkerRuntime:
 
         A worker with a GPU takes what needs one first, a slot beside one that has it the rest.
         """
-        if self.shutdown.is_set():
+        if self.shutdown.is_set() or not self._disk.has_room():
             return None
         has_gpu = self.identity.has_gpu and self._gpu.acquire(blocking=False)
         claim: Claim | None = None
@@ -291,7 +293,7 @@ class WorkerRuntime:
         return max(num_cores() // max(busy, 1), 1)
 
     def _offer(self) -> None:
-        if self._free.empty() or self.shutdown.is_set():
+        if self._free.empty() or self.shutdown.is_set() or not self._disk.has_room():
             return
         with self._database.read_scope() as session:
             served = self._served(session)

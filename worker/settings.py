@@ -37,7 +37,8 @@ class WorkerSettings(BaseSettings):
     min_free_bytes: int = Field(
         2**28,
         ge=0,
-        description="A stage starts only where its inputs and so many bytes more fit on the disk.",
+        description="A worker takes a stage only with so many bytes free on its disk, and starts "
+        "it only where the inputs that it still lacks fit beside them.",
     )
     transfers: int = Field(4, ge=1, le=64, description="Files moved at once by one slot.")
     prepare: bool = Field(

@@ -101,6 +101,23 @@ def _is_here(workspace: Workspace, wanted: StageInput) -> bool:
     return all(local.get(key) == wanted.manifest.get(key) for key in ("fingerprint", "content"))
 
 
+def _is_capture_here(workspace: Workspace, work: StageWork) -> bool:
+    path = workspace.capture_file
+    return path.is_file() and path.stat().st_size == work.capture_bytes
+
+
+def missing_bytes(
+    workspace: Workspace, reads: Iterable[str], work: StageWork, *, wants_capture: bool
+) -> int:
+    """What `fetch_inputs`, and `fetch_capture` where it is wanted, have yet to bring."""
+    inputs = [work.inputs[name] for name in reads if name in work.inputs]
+    missing = [found.manifest for found in inputs if not _is_here(workspace, found)]
+    needed = sum(item["bytes"] for manifest in missing for item in manifest.get("files", []))
+    if wants_capture and not _is_capture_here(workspace, work):
+        needed += work.capture_bytes
+    return int(needed)
+
+
 def fetch_inputs(
     store: ObjectStore,
     workspace: Workspace,
@@ -131,7 +148,7 @@ def fetch_capture(store: ObjectStore, workspace: Workspace, work: StageWork, gua
     """Bring the uploaded bytes."""
     with folder_lock(workspace.root, "fetch-capture", FETCH_LOCK_S):
         path = workspace.capture_file
-        if not path.is_file() or path.stat().st_size != work.capture_bytes:
+        if not _is_capture_here(workspace, work):
             path.parent.mkdir(parents=True, exist_ok=True)
             store.get_file(work.capture_key, path, lambda count: guard())
 

@@ -94,7 +94,7 @@ def _misbehave(plan: dict[str, Any], ctx: StageContext, witness: Path) -> None:
     if plan.get("fault"):
         raise ZeroDivisionError("/secret/path")
     while earlier < plan.get("hang_times", 0):  # alive, and it says the same again and again
-        ctx.progress(0.1, "hanging")
+        ctx.progress(plan.get("hang_at", 0.1), "hanging")
         time.sleep(0.1)
     if plan.get("deaf_s"):  # a native call that holds the interpreter: no Python thread runs
         ctypes.PyDLL(None).sleep(ctypes.c_uint(plan["deaf_s"]))

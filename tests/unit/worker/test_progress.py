@@ -64,6 +64,22 @@ def test_the_lease_is_extended_and_progress_and_log_are_written(
         assert read_logs(session, claim.job_id).lines == [f"line {step}" for step in range(50)]
 
 
+def test_seconds_left_alone_are_written_and_are_no_step_forward(
+    database: Database, claim: Claim
+) -> None:
+    with LeaseKeeper(database, claim, SETTINGS) as keeper:
+        keeper.report(0.5, "half", 9.0)
+        wait(lambda: row(database, claim).eta_s == 9.0)
+        moved_at = row(database, claim).progress_at
+        keeper.report(0.5, "half", 8.0, moved=False)
+        wait(lambda: row(database, claim).eta_s == 8.0)
+        assert row(database, claim).progress_at == moved_at
+        keeper.report(0.6, "more", 7.0)
+        keeper.report(0.6, "more", 6.0, moved=False)
+        wait(lambda: row(database, claim).eta_s == 6.0)
+        assert row(database, claim).progress_at != moved_at
+
+
 def test_a_cancel_is_noticed_within_seconds(database: Database, claim: Claim) -> None:
     with LeaseKeeper(database, claim, SETTINGS) as keeper:
         with database.session_scope() as session:

@@ -6,14 +6,17 @@ Real stage processes and a real database; no broker.
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,7 +24,7 @@ from deploy.embedded import free_port
 from storage.claims import claim_stage
 from storage.jobs import stage_id
 from storage.leases import owner_name
-from storage.models import StageRow
+from storage.models import Capture, Job, StageRow
 from storage.records import live_workers, register_worker
 from tests.integration.engine import Engine, is_running
 from worker.__main__ import MANY_CORES, default_slots, parse_arguments
@@ -227,12 +230,14 @@ def test_a_worker_whose_place_was_taken_while_it_slept_goes_on_under_another_id(
         runtime.close()
 
 
-@pytest.mark.parametrize(("times", "ends"), [(1, "succeeded"), (2, "failed")])
+@pytest.mark.parametrize(
+    ("times", "at", "ends"), [(1, 1.0, "succeeded"), (2, 0.1, "failed")], ids=["flood", "drip"]
+)
 def test_a_stage_that_hangs_is_ended_once_and_then_fails_the_job(
-    engine: Engine, times: int, ends: str
+    engine: Engine, times: int, at: float, ends: str
 ) -> None:
-    """It is alive and reports, always the same."""
-    job = engine.submit({"video": {"hang_times": times}}, ring=False)
+    """It is alive and reports, always the same; what is done is told without a pause between."""
+    job = engine.submit({"video": {"hang_times": times, "hang_at": at}}, ring=False)
     with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
         assert engine.wait_for(job, "succeeded", "failed").state == ends
     outcomes = engine.outcomes(job, "video")
@@ -248,25 +253,48 @@ def test_silence_counts_only_while_somebody_watches() -> None:
         pulse.silent_s(begun + second / 2)
     assert pulse.silent_s(begun + 5) == pytest.approx(5.0, abs=0.1)
     assert pulse.silent_s(begun + 5000) == pytest.approx(6.0, abs=0.1)  # it was frozen
-    pulse.notice({"type": "progress", "fraction": 0.5, "message": "half"})
+    assert pulse.notice({"type": "progress", "fraction": 0.5, "message": "half"})
     assert pulse.silent_s(begun + 5000) == 0.0
     pulse.silent_s(begun + 5001)
-    pulse.notice({"type": "progress", "fraction": 0.5, "message": "half"})
+    assert not pulse.notice({"type": "progress", "fraction": 0.5, "message": "half"})
     assert pulse.silent_s(begun + 5001) == 1.0
-    pulse.notice({"type": "checkpoint"})
+    assert pulse.notice({"type": "checkpoint"})
     assert pulse.silent_s(begun + 5001) == 0.0
 
 
-def test_a_stage_does_not_begin_on_a_disk_without_room(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stage_whose_inputs_do_not_fit_does_not_begin(engine: Engine) -> None:
     """Nothing is fetched; the job waits for its next try, and the error says how much is needed."""
-    monkeypatch.setenv("NERFWORKS_WORKER_MIN_FREE_BYTES", str(2**60))
     job = engine.submit({}, ring=False)
+    with engine.database.session_scope() as session:
+        session.get_one(Capture, session.get_one(Job, job).capture_id).bytes = 2**60
     with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
         engine.wait(lambda: engine.stage(job, "ingest").error, 20)
     error = engine.stage(job, "ingest").error
     assert error is not None
     assert error["code"] == "disk_full"
-    assert "needs 1073741824.0" in error["message"]
+    assert "needs 1073741824." in error["message"]
     assert not engine.notes("ingest start")
+
+
+def test_a_full_disk_fails_no_job_and_the_queue_goes_on_once_there_is_room(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    full = threading.Event()
+    full.set()
+    real = shutil.disk_usage
+
+    def usage(path: Path) -> Any:
+        found = real(path)
+        return found._replace(free=2**20) if full.is_set() else found
+
+    monkeypatch.setattr("worker.disk.shutil.disk_usage", usage)
+    job = engine.submit({}, ring=False)
+    with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)) as (runtime,):
+        for _ in range(3):
+            runtime.serve(stage_id(job, "ingest"))  # the bell rang
+        row = engine.stage(job, "ingest")
+        assert (row.state, row.attempt, row.error) == ("ready", 0, None)
+        said = [text for text in caplog.messages if "no stage is begun" in text]
+        assert len(said) == 1, "once, not every two seconds"
+        full.clear()
+        engine.wait(lambda: engine.stage(job, "ingest").state == "succeeded", 20)

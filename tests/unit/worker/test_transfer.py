@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,13 @@ from tests.factories import make_database, make_job
 from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.outcomes import crash_of, failure_of
 from worker.process import scrubbed_environment
-from worker.transfer import download_folder, fetch_inputs, restore_checkpoint, upload_folder
+from worker.transfer import (
+    download_folder,
+    fetch_inputs,
+    missing_bytes,
+    restore_checkpoint,
+    upload_folder,
+)
 
 
 def no_guard() -> None:
@@ -83,6 +90,25 @@ def test_inputs_come_once_and_again_only_where_they_differ(
     stage_folder(workspace.root, "of an attempt that was lost")
     fetch_inputs(store, workspace, reads, work, no_guard, workers=2)
     assert here.read_text() == "result"
+
+
+def test_what_lies_here_needs_no_room(store: LocalObjectStore, tmp_path: Path) -> None:
+    folder, manifest = stage_folder(tmp_path / "made", "result")
+    upload_folder(store, folder, "p/", no_guard, workers=1)
+    workspace = Workspace(tmp_path / "job")
+    work = replace(work_with(manifest), capture_bytes=5)
+
+    def missing(wants_capture: bool) -> int:
+        return missing_bytes(workspace, ["ingest", "train"], work, wants_capture=wants_capture)
+
+    assert (missing(False), missing(True)) == (6, 11)
+    fetch_inputs(store, workspace, ["train"], work, no_guard, workers=1)
+    assert (missing(False), missing(True)) == (0, 5)
+    workspace.capture_file.parent.mkdir(parents=True, exist_ok=True)
+    workspace.capture_file.write_bytes(b"half")
+    assert missing(True) == 5
+    workspace.capture_file.write_bytes(b"whole")
+    assert missing(True) == 0
 
 
 def test_a_damaged_input_is_not_accepted(store: LocalObjectStore, tmp_path: Path) -> None:
