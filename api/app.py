@@ -124,6 +124,14 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
         redoc_url=None,
     )
     app.state.settings = settings
+
+    @app.get("/docs", include_in_schema=False, response_class=HTMLResponse)
+    def get_documentation() -> HTMLResponse:
+        """The OpenAPI document as a page."""
+        return HTMLResponse(
+            page_of(app.openapi()), headers={"Content-Security-Policy": PAGE_POLICY}
+        )
+
     keyed = (captures.router, jobs.router, artifacts.router, catalogue.router)
     others = (artifacts.signed_router, health.router, catalogue.page_router)
     errors.install(
@@ -137,13 +145,6 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
         app.include_router(router, dependencies=[Depends(require_key)])
     for router in others:
         app.include_router(router)
-
-    @app.get("/docs", include_in_schema=False, response_class=HTMLResponse)
-    def get_documentation() -> HTMLResponse:
-        """The OpenAPI document as a page."""
-        return HTMLResponse(
-            page_of(app.openapi()), headers={"Content-Security-Policy": PAGE_POLICY}
-        )
 
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     return app

@@ -243,9 +243,12 @@ def delete_job(session: Session, job_id: str, when: datetime | None = None) -> N
     A queued job is dropped. Raises ConflictError while it runs or a stage of it has not stopped.
     """
     job, stages = lock_job(session, job_id)
-    if job.state in ("running", "cancelling") or any(row.state == "running" for row in stages):
-        raise ConflictError(f"Job {job_id} is {job.state}; cancel it first.")
-    for record in (Event, LogLine, StageRun, StageRow):
+    if job.state == "running":
+        raise ConflictError(f"Job {job_id} is running; cancel it first.")
+    if job.state == "cancelling" or any(row.state == "running" for row in stages):
+        raise ConflictError(f"Job {job_id} is {job.state}; wait until it has stopped.")
+    # Stages first: that waits for who just adds log lines, and holds off who would.
+    for record in (StageRow, Event, LogLine, StageRun):
         session.execute(delete(record).where(record.job_id == job_id))
     session.add(PendingDeletion(prefix=job_prefix(job_id), created_at=when or now(session)))
     session.execute(delete(Job).where(Job.id == job_id))

@@ -18,12 +18,14 @@ from botocore.exceptions import BotoCoreError, ClientError
 
 from storage.download_names import content_disposition
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
+from storage.keys import folder_of
 from storage.objects import CHUNK_BYTES, ObjectEntry, ObjectStat, OnBytes, check_key, check_prefix
 from storage.settings import StorageSettings
 
 _TRANSFER = TransferConfig(
     multipart_threshold=16 << 20, multipart_chunksize=16 << 20, max_concurrency=4
 )
+CONNECT_S = 5.0
 _MISSING = frozenset({"404", "NoSuchKey", "NotFound"})
 _FULL = frozenset({"507", "InsufficientStorage", "QuotaExceeded", "XMinioStorageFull"})
 
@@ -50,7 +52,9 @@ class S3ObjectStore:
         self._bucket = bucket
         self._prefix = f"{prefix}/" if prefix else ""
         endpoint, silence_s = settings.s3_endpoint_url, settings.s3_timeout_s
-        self._client = _make_client(settings, endpoint, silence_s, 4)
+        # urllib3 sends a body under the time for connecting: a store that pauses is no reason to
+        # break a transfer off.
+        self._client = _make_client(settings, endpoint, silence_s, 4, connect_s=silence_s)
         # Short calls, which people wait for: each answers or fails within seconds.
         self._quick = _make_client(settings, endpoint, silence_s / 4, 2)
         public = settings.s3_public_endpoint_url
@@ -142,7 +146,10 @@ class S3ObjectStore:
                     yield ObjectEntry(key, item["LastModified"])
 
     def drop_unfinished(self, before: datetime) -> int:
-        """Drop what transfers that were cut short before then left. Returns how many."""
+        """Drop what transfers that were cut short before then left. Returns how many.
+
+        Only where our own objects lie: the bucket may be shared, with an empty prefix, too.
+        """
         dropped = 0
         with _translated("half-done uploads"):
             pages = self._quick.get_paginator("list_multipart_uploads").paginate(
@@ -150,7 +157,8 @@ class S3ObjectStore:
             )
             for page in pages:
                 for item in page.get("Uploads", []):
-                    if item["Initiated"] < before:
+                    is_ours = folder_of(item["Key"].removeprefix(self._prefix)) is not None
+                    if is_ours and item["Initiated"] < before:
                         self._quick.abort_multipart_upload(
                             Bucket=self._bucket, Key=item["Key"], UploadId=item["UploadId"]
                         )
@@ -181,7 +189,14 @@ class S3ObjectStore:
                 raise ObjectStoreError(f"Bucket {self._bucket} cannot be used.") from error
 
 
-def _make_client(settings: StorageSettings, endpoint: str, silence_s: float, attempts: int) -> Any:
+def _make_client(
+    settings: StorageSettings,
+    endpoint: str,
+    silence_s: float,
+    attempts: int,
+    *,
+    connect_s: float = CONNECT_S,
+) -> Any:
     return boto3.client(
         "s3",
         endpoint_url=endpoint or None,
@@ -191,7 +206,7 @@ def _make_client(settings: StorageSettings, endpoint: str, silence_s: float, att
         config=Config(
             signature_version="s3v4",
             s3={"addressing_style": "path" if settings.s3_path_style else "auto"},
-            connect_timeout=min(5.0, silence_s),
+            connect_timeout=min(connect_s, silence_s),
             read_timeout=silence_s,
             tcp_keepalive=True,
             max_pool_connections=20,

@@ -148,9 +148,11 @@ def append_logs(
 ) -> int:
     """Add lines that a stage wrote, up to MAX_LOG_LINES a stage. Returns how many were kept.
 
-    None of a claim that another one has replaced, or whose job was deleted.
+    None of a claim that another one has replaced, or whose job was deleted. Until the lines are
+    committed nobody deletes the job.
     """
-    latest = session.scalar(select(StageRow.lease_token).where(StageRow.id == claim.stage_id))
+    token = select(StageRow.lease_token).where(StageRow.id == claim.stage_id)
+    latest = session.scalar(token.with_for_update(read=True, key_share=True))
     if latest is None or latest > claim.token:
         return 0
     mine = (LogLine.job_id == claim.job_id, LogLine.stage == claim.name)

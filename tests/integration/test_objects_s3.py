@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import urllib.error
 import urllib.request
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from storage.errors import ObjectMissingError, ObjectStoreError
+from storage.keys import capture_content
 from storage.objects import ObjectStore
+from storage.objects_s3 import S3ObjectStore
 from storage.open_objects import open_object_store
 from storage.settings import StorageSettings
 from tests.services import S3Endpoint
@@ -95,6 +98,41 @@ def test_a_transfer_ends_with_what_its_watcher_raises(store: ObjectStore, tmp_pa
     (tmp_path / "source").write_bytes(b"0" * 1000)
     with pytest.raises(CancelledError):
         store.put_file("k", tmp_path / "source", stop)
+
+
+def test_a_transfer_has_the_time_of_silence_for_its_body_and_short_calls_do_not(
+    store: ObjectStore,
+) -> None:
+    """urllib3 sends a body under the time-out for connecting."""
+    assert isinstance(store, S3ObjectStore)
+    transfers, quick = store._client.meta.config, store._quick.meta.config
+    assert transfers.connect_timeout == transfers.read_timeout == StorageSettings().s3_timeout_s
+    assert quick.connect_timeout <= quick.read_timeout < transfers.read_timeout
+
+
+@pytest.mark.parametrize("prefix", ["", "objects"])
+def test_only_our_own_half_done_uploads_are_dropped(
+    s3_endpoint: S3Endpoint, monkeypatch: pytest.MonkeyPatch, prefix: str
+) -> None:
+    """A bucket without a prefix is shared with whoever else writes there."""
+    for name, value in s3_endpoint.environment(prefix).items():
+        monkeypatch.setenv(name, value)
+    store = open_object_store(StorageSettings())
+    assert isinstance(store, S3ObjectStore)
+    below = f"{prefix}/" if prefix else ""
+    ours = {below + key for key in (capture_content("c"), "jobs/j/train/1-2/model.zip")}
+    theirs = {below + key for key in ("backups/db.tar", "jobs/notes.txt", "jobs/a/b/c/d")}
+    for key in ours | theirs:
+        store._client.create_multipart_upload(Bucket=s3_endpoint.bucket, Key=key)
+
+    def begun() -> set[str]:
+        answer = store._client.list_multipart_uploads(Bucket=s3_endpoint.bucket)
+        return {item["Key"] for item in answer.get("Uploads", [])}
+
+    assert begun() == ours | theirs
+    assert store.drop_unfinished(datetime.now(UTC) - timedelta(hours=1)) == 0
+    assert store.drop_unfinished(datetime.now(UTC) + timedelta(hours=1)) == len(ours)
+    assert begun() == theirs
 
 
 def test_ping_tells_a_bucket_that_is_not_there(

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from storage.claims import claim_stage
 from storage.db import Database, now
 from storage.errors import NotFoundError
-from storage.jobs import StageSeed, create_job, delete_job, stage_id
-from storage.leases import reap_expired, succeed_stage
+from storage.jobs import StageSeed, create_job, delete_job, request_cancel, stage_id
+from storage.leases import cancel_stage, reap_expired, succeed_stage
+from storage.models import LogLine
 from storage.queries import get_job, list_jobs
 from storage.records import append_logs, delete_capture, get_capture, read_logs
 from storage.schema import upgrade
@@ -124,6 +127,53 @@ def test_no_job_is_made_on_a_capture_that_was_just_deleted(database: Database) -
                 stages=[StageSeed("first", ())],
             )
         assert seen.deleted_at is not None
+
+
+def wait_for_a_lock(database: Database) -> None:
+    """Until somebody waits for a lock that another session holds."""
+    deadline = time.monotonic() + 10
+    query = text("SELECT count(*) FROM pg_locks WHERE NOT granted")
+    while True:
+        with database.read_scope() as session:
+            if session.scalar(query):
+                return
+        assert time.monotonic() < deadline, "nobody waits"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("first", ["lines", "deletion"])
+def test_a_job_is_deleted_beside_a_late_log_line(database: Database, first: str) -> None:
+    """The worker still flushes what the cancelled stage wrote."""
+    with database.session_scope() as session:
+        job = make_job(session).id
+        claim = claim_stage(session, stage_id(job, "first"), "w", 60.0)
+        assert claim is not None
+        request_cancel(session, job)
+        cancel_stage(session, claim)
+
+    def add() -> int:
+        with database.session_scope() as session:
+            return append_logs(session, claim, ["late"])
+
+    def drop() -> None:
+        with database.session_scope() as session:
+            delete_job(session, job)
+
+    other: Future[int] | Future[None]
+    with ThreadPoolExecutor(1) as pool, database.session_scope() as session:
+        if first == "lines":
+            assert append_logs(session, claim, ["late"]) == 1
+            other = pool.submit(drop)
+        else:
+            delete_job(session, job)
+            other = pool.submit(add)
+        wait_for_a_lock(database)
+        session.commit()
+        assert other.result(10) == (None if first == "lines" else 0)
+    with database.read_scope() as session:
+        assert session.scalars(select(LogLine)).all() == []
+        with pytest.raises(NotFoundError):
+            get_job(session, job)
 
 
 def last_state(session: Session, job: str) -> str:

@@ -216,12 +216,22 @@ def test_every_address_names_all_its_methods_and_answers_head(odd: Service) -> N
         ("/v1/presets", "GET, HEAD"),
         ("/livez", "GET, HEAD"),
         ("/", "GET, HEAD"),
+        ("/docs", "GET, HEAD"),
+        ("/openapi.json", "GET, HEAD"),
     ):
         for method in ("PATCH", "TRACE", "OPTIONS", "BREW"):
             answer = odd.http.request(method, path)
             problem(answer, 405, "method_not_allowed")
             assert answer.headers["allow"] == allowed, path
-    for path in ("/v1/jobs", f"/v1/jobs/{job}", "/v1/options", "/livez", "/", "/openapi.json"):
+    for path in (
+        "/v1/jobs",
+        f"/v1/jobs/{job}",
+        "/v1/options",
+        "/livez",
+        "/",
+        "/docs",
+        "/openapi.json",
+    ):
         head, whole = odd.http.head(path), odd.http.get(path)
         assert (head.status_code, head.content) == (200, b""), path
         assert head.headers["content-length"] == str(len(whole.content)), path

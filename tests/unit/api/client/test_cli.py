@@ -201,10 +201,12 @@ def test_status_list_logs_cancel_delete_and_presets(
     assert capsys.readouterr().out == "second [red] [31m line\n"
     assert cli.main(["list", "--state", "running"]) == 0
     assert "ingest 50%" in capsys.readouterr().out
+    assert cli.main(["delete", job]) == 1
+    assert "cancel it first" in capsys.readouterr().err
     assert cli.main(["cancel", job]) == 0
     assert "cancelling" in capsys.readouterr().out
     assert cli.main(["delete", job]) == 1
-    assert "cancel it first" in capsys.readouterr().err
+    assert "is cancelling; wait until it has stopped" in capsys.readouterr().err
     assert cli.main(["presets"]) == 0
     shown = capsys.readouterr().out
     assert all(preset in shown for preset in PRESETS), shown
