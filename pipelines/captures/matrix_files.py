@@ -19,6 +19,9 @@ _SLACK = 1e-3
 """How far the last row of a matrix may be from 0 0 0 1; files are rounded."""
 _MATRIX_BYTES = 1 << 16
 _LIST_BYTES = 64 << 20
+MOST_ROWS = 200_000
+"""Of a list: an hour of film at 55 frames a second."""
+MOST_ROW_BYTES = 10_000
 
 
 def broken(message: str) -> CaptureError:
@@ -40,8 +43,12 @@ def starts_with_numbers(head: bytes) -> bool:
 
 def read_numbers(archive: CaptureArchive, name: str, max_bytes: int) -> list[list[float]]:
     """The rows of a file, which may be none. Raises CaptureError poses_malformed, too_large."""
+    data = archive.read(name, max_bytes)
+    require_few_rows(data, name)
     rows = []
-    for number, line in enumerate(archive.read(name, max_bytes).splitlines(), start=1):
+    for number, line in enumerate(data.splitlines(), start=1):
+        if len(line) > MOST_ROW_BYTES:
+            raise broken(f'Row {number} of "{shown(name)}" is too long.')
         words = line.decode("ascii", "replace").replace(",", " ").split()
         if not words or words[0].startswith("#"):
             continue
@@ -50,6 +57,18 @@ def read_numbers(archive: CaptureArchive, name: str, max_bytes: int) -> list[lis
             raise broken(f'Row {number} of "{shown(name)}" is not of numbers.')
         rows.append([value for value in values if value is not None])
     return rows
+
+
+def require_few_rows(data: bytes, name: str) -> None:
+    """Raise CaptureError too_large for a file of more rows than are read. Asked before they are
+    split: as objects of their own, rows of a letter take hundreds of times their bytes."""
+    num_rows = data.count(b"\n") + data.count(b"\r")
+    if num_rows > 2 * MOST_ROWS or num_rows - data.count(b"\r\n") > MOST_ROWS:
+        raise CaptureError(
+            f'"{shown(name)}" has more than {MOST_ROWS} rows.',
+            code="too_large",
+            hint="Send a part of the capture, with fewer frames.",
+        )
 
 
 def read_matrix(archive: CaptureArchive, name: str) -> list[float]:

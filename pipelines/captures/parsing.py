@@ -20,7 +20,15 @@ _ASPECT_SLACK = 0.02
 FRAME_FAULTS = frozenset({"poses_malformed", "poses_missing", "image_undecodable"})
 """Codes of errors that one frame may have without the capture being of no use."""
 
+MOST_FAILURES = 0.1
+"""Share of the frames that may be unusable: stray damage stays below, a wrong export does not."""
+
 Frame = TypeVar("Frame")
+
+
+def most_failures(num_frames: int) -> int:
+    """How many errors of that many frames are kept: more are too many anyhow, and are the same."""
+    return max(1000, round(2 * MOST_FAILURES * num_frames))
 
 
 def malformed(message: str, hint: str = "Export the capture again from the app.") -> CaptureError:

@@ -209,7 +209,7 @@ def _look(
     looked = []
     raw = scratch / "raw"
     for number, name in enumerate(names):
-        raw.write_bytes(archive.peek(name, archive.num_bytes(name)))
+        archive.copy(name, raw)
         try:
             image = opened(raw, name, archive.image_format(name), options.max_pixels)
         except CaptureError:

@@ -61,7 +61,7 @@ def write_posed(
     """
     if capture.readings:
         capture = proven(archive, capture, options, ctx)
-    sources = capture.sources
+    sources, num_passed_over = capture.sources, 0
     if capture.is_dense:
         picked = evenly_picked(len(sources), options.max_posed_images)
         kept = set(picked)
@@ -70,7 +70,7 @@ def write_posed(
             [name for item in left for name in (item.name, *item.depth_files)],
             f"of {len(sources)} pictures {len(picked)} are taken, at even distances",
         )
-        sources = [sources[index] for index in picked]
+        sources, num_passed_over = [sources[index] for index in picked], len(left)
     depths = DepthWriter(archive, ctx.out, max_pixels=options.max_pixels)
     film = FilmFrames(archive, ctx.out, max_pixels=options.max_pixels)
     try:
@@ -84,6 +84,7 @@ def write_posed(
             upright=False,
             minimum=MIN_POSED_IMAGES,
             failures=capture.failures,
+            num_passed_over=num_passed_over,
         )
     finally:
         film.close()

@@ -115,8 +115,12 @@ class CaptureArchive:
         Raises CaptureError: archive_bomb where it holds more than it declared or than is allowed,
         archive_damaged. `target` may then be incomplete.
         """
-        info = self._entries[name]
         self._used.add(name)
+        self.copy(name, target)
+
+    def copy(self, name: str, target: Path) -> None:
+        """As `extract`, only to look at: the entry does not count as used."""
+        info = self._entries[name]
         written = 0
         with reading():
             source = self._zip.open(info)

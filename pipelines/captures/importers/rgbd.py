@@ -31,7 +31,13 @@ from pipelines.captures.matrix_files import (
     starts_with_numbers,
 )
 from pipelines.captures.orders import orders, paired, readings_of
-from pipelines.captures.parsing import each_frame, missing, opengl_camera, some_of
+from pipelines.captures.parsing import (
+    each_frame,
+    missing,
+    most_failures,
+    opengl_camera,
+    some_of,
+)
 from pipelines.captures.rgbd_lenses import (
     REPLICA,
     REPLICA_SEMANTIC,
@@ -275,7 +281,8 @@ def _by_list(
                 pose_of(row, f"Row {number} of {what}")
                 usable.add(number)
             except CaptureError as error:
-                failures.append(error)
+                if len(failures) <= most_failures(len(rows)):
+                    failures.append(error)
 
     def source(name: str, row: int) -> PosedSource | None:
         if row not in usable:

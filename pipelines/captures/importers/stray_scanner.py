@@ -16,19 +16,25 @@ Source: github.com/strayrobots/scanner, docs/format.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.magic import video_container
-from pipelines.captures.matrix_files import lens_of, read_matrix
+from pipelines.captures.matrix_files import (
+    MOST_ROW_BYTES,
+    lens_of,
+    read_matrix,
+    require_few_rows,
+)
 from pipelines.captures.orders import numbered
 from pipelines.captures.parsing import (
     FRAME_FAULTS,
     malformed,
     missing,
+    most_failures,
     opengl_camera,
     rotation_of,
     some_of,
@@ -76,8 +82,9 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
             code="no_images",
             hint=f"Export the whole folder of the recording from the app, with {_FILM}.",
         )
-    rows = _rows(archive, root + _FILE)
-    if not rows:
+    lines = _lines(archive, root + _FILE)
+    names = _columns(lines)
+    if len(lines) < 2:
         raise missing(f"{_FILE} has no poses.")
     shared = None
     if root + _MATRIX in archive.names:
@@ -86,7 +93,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     sources: dict[int, PosedSource] = {}
     failures: list[CaptureError] = []
     numbers: set[int] = set()
-    for line, row in rows:
+    for line, row in _rows(names, lines):
         try:
             source = _source(film, row, f"Row {line} of {_FILE}", shared, depths)
             number = source.frame or 0
@@ -96,7 +103,8 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         except CaptureError as error:
             if error.code not in FRAME_FAULTS:
                 raise
-            failures.append(error)
+            if len(failures) <= most_failures(len(lines)):
+                failures.append(error)
         numbers.add(_frame_number(row))
     if not sources:
         raise failures[0]
@@ -108,23 +116,37 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         metric=True,
         is_dense=True,
         notes={"world": "ARKit, turned to +Z up"},
-        details={"num_poses": len(rows)},
+        details={"num_poses": len(lines) - 1},
         warnings=_without_depth(sources, depths),
     )
 
 
-def _rows(archive: CaptureArchive, file: str) -> list[tuple[int, Row]]:
-    """The rows, by the names of their columns, with their line in the file."""
-    lines = archive.read(file, _LIST_BYTES).decode("utf-8", "replace").splitlines()
-    names = [name.strip() for name in lines[0].split(",")] if lines else []
+def _lines(archive: CaptureArchive, file: str) -> list[tuple[int, str]]:
+    """The lines that are not empty, the names of columns first, with their numbers in the file."""
+    data = archive.read(file, _LIST_BYTES)
+    require_few_rows(data, file)
+    # Not `splitlines`, which also splits at what was not counted.
+    lines = enumerate(data.decode("utf-8", "replace").split("\n"), start=1)
+    found = [(number, line) for number, line in lines if line.strip()]
+    for number, line in found:
+        if len(line) > MOST_ROW_BYTES:
+            raise malformed(f"Row {number} of {_FILE} is too long.")
+    return found
+
+
+def _columns(lines: Sequence[tuple[int, str]]) -> list[str]:
+    """The names of columns. Raises CaptureError poses_malformed where some are not there."""
+    names = [name.strip() for name in lines[0][1].split(",")] if lines else []
     lacking = [name for name in ("frame", *_POSE) if name not in names]
     if lacking:
         raise malformed(f"{_FILE} has no columns {', '.join(lacking)}.")
-    return [
-        (number, dict(zip(names, (cell.strip() for cell in line.split(",")), strict=False)))
-        for number, line in enumerate(lines[1:], start=2)
-        if line.strip()
-    ]
+    return names
+
+
+def _rows(names: Sequence[str], lines: Sequence[tuple[int, str]]) -> Iterator[tuple[int, Row]]:
+    """The rows, by the names of their columns, with their line in the file."""
+    for number, line in lines[1:]:
+        yield number, dict(zip(names, (cell.strip() for cell in line.split(",")), strict=False))
 
 
 def _frame_number(row: Row) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +15,14 @@ from pipelines.captures.contents import Reading
 from pipelines.captures.importer import Claim
 from pipelines.captures.importers import llff
 from pipelines.captures.orders import AS_TEXT, COUNTED, FROM_0, FROM_1, frame_number, orders, paired
-from pipelines.captures.pose_order import epipolar_distances, proven
+from pipelines.captures.pose_order import _look, epipolar_distances, proven
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 from pipelines.options import IngestOptions
 from pipelines.sample.film import hand_held_pose, phone_camera
 from pipelines.scene.cameras_file import Intrinsics
 from tests.app_writers import write_llff
-from tests.unit.pipelines.captures.archives import context
+from tests.unit.pipelines.captures.archives import context, picture, write_zip
 
 LENS = phone_camera(480)
 WIDE = Intrinsics(400, 300, 250.0, 255.0, 190.0, 160.0)
@@ -143,3 +145,16 @@ def test_files_pair_by_name_and_only_then_by_number(
             name: others[at] for name, at in zip(names, found, strict=True) if at is not None
         }
         assert paired(names, others) == expected
+
+
+def test_pictures_are_looked_at_as_they_stream_by(tmp_path: Path) -> None:
+    """24 MiB that follow a picture's end are in no memory, and none counts as used."""
+    path = write_zip(tmp_path / "c", {"a.jpg": picture() + os.urandom(24 << 20)}, 0)
+    with CaptureArchive(path, ArchiveLimits()) as archive:
+        tracemalloc.start()
+        looked = _look(archive, ["a.jpg"], tmp_path, IngestOptions())
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert [(item.width, item.height) for item in looked] == [(64, 48)]
+        assert list(archive.unused) == ["a.jpg"]
+    assert peak < 12 << 20

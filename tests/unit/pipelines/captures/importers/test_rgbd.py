@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pipelines.captures.orders import frame_number
+from pipelines.options import IngestOptions
 from pipelines.sample.scene import pose_matrix
 from tests.app_writers import write_replica
 from tests.unit.pipelines.captures.archives import (
@@ -252,6 +253,31 @@ def test_a_list_that_is_none_is_refused_or_no_list(
         error = failure(tmp_path, files)
         assert error.code == code
         assert why in error.message
+
+
+def test_lists_of_absurdly_many_rows_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    """Rows of one number would take hundreds of times their bytes."""
+    digits = np.random.default_rng(1).integers(0, 10, 200_002)
+    for number, end in enumerate(("\n", "\r", "\r\n")):
+        files = rgbd_files(11, "list") | {"poses.txt": end.join(map(str, digits))}
+        error = failure(tmp_path / str(number), files)
+        assert (error.code, "200000 rows" in error.message) == ("too_large", True)
+    files = rgbd_files(11, "list") | {"poses.txt": " ".join(map(str, digits))}
+    error = failure(tmp_path / "long", files)
+    assert (error.code, "too long" in error.message) == ("poses_malformed", True)
+
+
+def test_faults_of_a_long_capture_are_weighed_against_all_of_it(tmp_path: Path) -> None:
+    """3 of 40 are few, also where only 6 of the rest are taken; 8 of 40 are many."""
+    options = IngestOptions(max_posed_images=6)
+    files = rgbd_files(40)
+    summary, _ = ingest(
+        tmp_path / "few", files | {f"pose/{n}.txt": rows_of(NAN) for n in (3, 9, 22)}, options
+    )
+    assert summary["num_posed"] == 6
+    many = files | {f"pose/{n}.txt": rows_of(NAN) for n in range(8)}
+    error = failure(tmp_path / "many", many, options)
+    assert (error.code, "8 of 40 pictures" in error.message) == ("poses_malformed", True)
 
 
 def test_a_row_of_a_list_that_is_no_pose_is_left_out(tmp_path: Path) -> None:

@@ -176,3 +176,14 @@ def test_a_table_of_another_program_is_not_this_app(tmp_path: Path) -> None:
     files: dict[str, bytes | str] = {f"{n}.jpg": picture(seed=n) for n in range(8)}
     summary, _ = ingest(tmp_path, files | {"odometry.csv": "time,x,y,z\n", "rgb.mp4": film()})
     assert summary["kind"] == "images"
+
+
+def test_lists_of_absurdly_many_rows_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    head = str(stray_files(b"")[LIST]).splitlines()[0]
+    digits = np.random.default_rng(1).integers(0, 10, 200_002)
+    error = failure(tmp_path, recording() | {LIST: "\n".join([head, *map(str, digits)])})
+    assert (error.code, "200000 rows" in error.message) == ("too_large", True)
+    # Each of these would be a line of its own for `str.splitlines`.
+    rows = "\n".join([head, "\x1c".join(map(str, digits))])
+    error = failure(tmp_path / "odd", recording() | {LIST: rows})
+    assert (error.code, "Row 2" in error.message) == ("poses_malformed", True)
