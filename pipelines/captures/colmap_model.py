@@ -12,6 +12,7 @@ import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
@@ -25,6 +26,8 @@ MIN_TRACK = 3
 """Points that fewer images have seen are left out where the file says how many have: most of them
 are wrong."""
 MOST_POINTS = 2_000_000
+MOST_IMAGES = 200_000
+"""Of a model, and as many cameras."""
 _LONGEST_LINE = 64 << 20
 _LONGEST_NAME = 4096
 _NUMBERS = {lens.number: (name, len(lens.terms)) for name, lens in COLMAP_LENSES.items()}
@@ -52,13 +55,21 @@ def read_cameras(path: Path, file: str) -> dict[int, Lens]:
     """The cameras by their ids. path: where it lies. file: what messages call it; a name that ends
     with .bin is binary. Raises CaptureError poses_malformed."""
     rows = _binary_cameras if file.endswith(".bin") else _text_cameras
-    return {number: _lens(model, size, params) for number, model, size, params in rows(path, file)}
+    cameras: dict[int, Lens] = {}
+    for number, model, size, params in rows(path, file):
+        cameras[number] = _lens(model, size, params)
+        if len(cameras) > MOST_IMAGES:
+            raise malformed(f"{file} has more than {MOST_IMAGES} cameras.", _HINT)
+    return cameras
 
 
 def read_images(path: Path, file: str) -> list[Image]:
     """The images in the order of the file. Arguments and errors as `read_cameras`."""
     read = _binary_images if file.endswith(".bin") else _text_images
-    return list(read(path, file))
+    images = list(islice(read(path, file), MOST_IMAGES + 1))
+    if len(images) > MOST_IMAGES:
+        raise malformed(f"{file} has more than {MOST_IMAGES} images.", _HINT)
+    return images
 
 
 def read_points(path: Path, file: str) -> SparsePoints:

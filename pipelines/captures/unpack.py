@@ -30,6 +30,8 @@ from pipelines.errors import CaptureError
 
 _CHUNK_BYTES = 1 << 20
 MAX_JSON_BYTES = 64 << 20
+MAX_JSON_PARTS = 10_000_000
+"""Lists and objects of a JSON file: empty ones take thirty times their bytes."""
 
 
 class CaptureArchive:
@@ -155,8 +157,15 @@ class CaptureArchive:
 
     def read_json(self, name: str, max_bytes: int = MAX_JSON_BYTES) -> Any:
         """One entry as JSON. Raises CaptureError as `read`; poses_malformed where it is none."""
+        data = self.read(name, max_bytes)
+        if data.count(b"{") + data.count(b"[") > MAX_JSON_PARTS:
+            raise CaptureError(
+                f'"{shown(name)}" in the archive has more than {MAX_JSON_PARTS} lists and objects.',
+                code="too_large",
+                hint="Export the capture again, with fewer frames or points.",
+            )
         try:
-            return json.loads(self.read(name, max_bytes))
+            return json.loads(data)
         except (ValueError, RecursionError) as error:
             raise CaptureError(
                 f'"{shown(name)}" in the archive is not readable JSON.',

@@ -14,7 +14,7 @@ import math
 import re
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -49,6 +49,7 @@ _TEXTS = {
 }
 """How the texts start: with COLMAP's comments, or with others or none and a camera or an image."""
 _MOST_LISTED = 1 << 24
+_MOST_MODELS = 200
 _FILES = ("cameras", "images", "points3D", "frames", "rigs")
 
 Read = TypeVar("Read")
@@ -90,18 +91,24 @@ def _is_list(heads: Mapping[str, bytes], folder: str, what: str, suffix: str) ->
 
 @dataclass(frozen=True)
 class _Model:
-    """folder: that it lies in. suffix: of its files. num_there: images whose pictures are there."""
+    """folder: that it lies in. suffix: of its files. num_there: images whose pictures are there.
+    images: none where another model has more of them there."""
 
     folder: str
     suffix: str
     images: list[Image]
+    num_images: int
     num_there: int
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        return self.num_there, self.num_images
 
     def file(self, what: str) -> str:
         return f"{self.folder}{what}{self.suffix}"
 
     def __str__(self) -> str:
-        return f'"{shown(self.file("images"))}" ({len(self.images)} images)'
+        return f'"{shown(self.file("images"))}" ({self.num_images} images)'
 
 
 def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
@@ -115,7 +122,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         models, faults = _models(archive, unpacked)
         if not models:
             raise faults[0]
-        best = max(models, key=lambda model: (model.num_there, len(model.images)))
+        best = max(models, key=lambda model: model.rank)
         cameras = unpacked.read(best.file("cameras"), read_cameras)
         points, lost = _points(archive, unpacked, best)
     file = best.file("images")
@@ -178,14 +185,17 @@ def _models(
 ) -> tuple[list[_Model], list[CaptureError]]:
     """The models that can be read, the least deep first, binary before text; and why others cannot.
 
-    Of a folder with both, text is only read where binary cannot be.
+    Of a folder with both, text is only read where binary cannot be. The images of one model alone,
+    the best, are kept.
     """
+    best = (-1, -1)
     found: dict[str, _Model] = {}
     faults: list[CaptureError] = []
     places = [
         (folder, suffix) for suffix in _SUFFIXES for folder in _folders(archive.names, suffix)
     ]
-    for folder, suffix in sorted(places, key=lambda place: (place[0].count("/"), place)):
+    places.sort(key=lambda place: (place[0].count("/"), place))
+    for folder, suffix in places[:_MOST_MODELS]:
         if folder in found:
             continue
         try:
@@ -198,7 +208,16 @@ def _models(
         names = [image.name for image in images]
         files = NamedFiles(archive.images, folder_of(archive.images, names, folder))
         exact, loose = files.find(names)
-        found[folder] = _Model(folder, suffix, images, len(exact) + len(loose))
+        model = _Model(folder, suffix, images, len(images), len(exact) + len(loose))
+        if model.rank > best:
+            found = {place: replace(other, images=[]) for place, other in found.items()}
+            best = model.rank
+        else:
+            model = replace(model, images=[])
+        found[folder] = model
+    if len(places) > _MOST_MODELS:
+        told = f"of {len(places)} the first {_MOST_MODELS} are looked at."
+        faults.append(malformed(told, "Send one model with its pictures."))
     return list(found.values()), faults
 
 

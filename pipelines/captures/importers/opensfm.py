@@ -51,6 +51,7 @@ _CAMERAS = "cameras.json"
 _LIST = re.compile(rb"(\xef\xbb\xbf)?\s*\[\s*\{")
 """How a list of reconstructions starts."""
 _MOST_BYTES = 256 << 20
+_MOST_MODELS = 1000
 _MOST_DOP = 100.0
 """Dilution of precision above which a shot's GPS is none: OpenSfM writes 999999 where there is."""
 _FEW = 3
@@ -156,6 +157,8 @@ def _reconstructions(archive: CaptureArchive, name: str) -> list[_Model]:
     raw = archive.read_json(name, _MOST_BYTES)
     if not isinstance(raw, list) or not raw:
         raise missing(f"{shown(name)} has no reconstructions.")
+    if len(raw) > _MOST_MODELS:
+        raise malformed(f"{shown(name)} has {len(raw)} reconstructions; {_MOST_MODELS} are read.")
     models = []
     for index, entry in enumerate(raw):
         entry = entry if isinstance(entry, dict) else {"shots": None}

@@ -17,11 +17,13 @@ Source: VisualSFM's documentation, "The NVM Format".
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from pipelines.captures.archive_rules import shown
+from pipelines.captures.colmap_model import MOST_IMAGES, MOST_POINTS
 from pipelines.captures.contents import PosedPictures, PosedSource, SparsePoints
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.listed_pictures import match_pictures
@@ -32,6 +34,7 @@ from pipelines.scene.natural_order import natural_key
 
 _MARK = b"NVM_V3"
 _MOST_BYTES = 256 << 20
+_LONGEST_LINE = 1 << 20
 _MIN_TRACK = 3
 _CAMERA_NUMBERS = 10
 
@@ -55,8 +58,8 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     Raises CaptureError: poses_missing, poses_malformed.
     """
     file = shown(claim.root + claim.why)
-    text = archive.read(claim.root + claim.why, _MOST_BYTES).decode("utf-8", "replace")
-    models = list(_models(text, file))
+    data = archive.read(claim.root + claim.why, _MOST_BYTES)
+    models = list(_models(data, file))
     if not models:
         raise missing(f"{file} has no cameras.")
     best = max(models, key=lambda model: len(model.cameras))
@@ -157,12 +160,27 @@ class _Span:
         return (2 * max(-self.low[0], self.high[0]), 2 * max(-self.low[1], self.high[1]))
 
 
-def _models(text: str, file: str) -> Iterator[_Model]:
+def _lines(data: bytes, file: str) -> Lines:
+    """The lines that say something, with their numbers; one at a time, as a file has millions."""
+    stream = io.TextIOWrapper(io.BytesIO(data), "utf-8", errors="replace", newline="\n")
+    number = 0
+    while line := stream.readline(_LONGEST_LINE):
+        number += 1
+        if len(line) == _LONGEST_LINE:
+            raise malformed(f"Line {number} of {file} is endless.")
+        if line.strip() and not line.startswith("#"):
+            yield number, line
+
+
+def _models(data: bytes, file: str) -> Iterator[_Model]:
     """The models of a file with at least one camera, up to the count of 0 that ends it."""
-    lines = ((n, line) for n, line in enumerate(text.split("\n"), start=1) if line.strip())
-    lines = ((n, line) for n, line in lines if not line.startswith("#"))
+    lines = _lines(data, file)
     next(lines, None)
+    total = 0
     while (count := _count(lines, file)) > 0:
+        total += count
+        if total > MOST_IMAGES:
+            raise malformed(f"{file} has more than {MOST_IMAGES} cameras.")
         cameras = [_camera(*_line(lines, file), file) for _ in range(count)]
         places, colors = [], []
         spans = [_Span() for _ in cameras]
@@ -181,6 +199,8 @@ def _models(text: str, file: str) -> Iterator[_Model]:
             if seen >= _MIN_TRACK:
                 places.append(place)
                 colors.append(color)
+                if len(places) > MOST_POINTS:
+                    raise malformed(f"{file} has more than {MOST_POINTS} points.")
         centred = any(min(span.low) < 0.0 for span in spans)
         pairs = zip(cameras, spans, strict=True)
         cameras = [replace(camera, needs=span.needs(centred)) for camera, span in pairs]

@@ -11,6 +11,8 @@ import pycolmap
 import pytest
 import torch
 
+from pipelines.captures import colmap_model
+from pipelines.captures.importers import colmap
 from pipelines.captures.sniff import sniff
 from pipelines.exports.formats.ply import read_ply
 from pipelines.nerf.space import lenses as formulas
@@ -268,6 +270,36 @@ def test_faults_are_refused_by_name(tmp_path: Path, old: str, new: str, name: st
     error = failure(tmp_path, PICTURES | rewritten(old, new, name))
     assert error.code == "poses_malformed"
     assert any(word in error.message for word in ("IMG_", "cameras.txt", "images.txt"))
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+@pytest.mark.parametrize("what", ["images", "cameras"])
+def test_more_than_a_model_may_have_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, what: str
+) -> None:
+    truth = walked(*(replace(TRUTH.cameras[0], fl_x=60.0 + n) for n in range(9)), num=9)
+    files = pictures_of(truth) | colmap_files(truth, form=form)
+    monkeypatch.setattr(colmap_model, "MOST_IMAGES", 9)
+    assert ingest(tmp_path / "enough", files)[0]["num_posed"] == 9
+    if what == "images":
+        truth = walked(*TRUTH.cameras[:1], num=10)
+    else:
+        truth = replace(truth, cameras=(*truth.cameras, truth.cameras[0]))
+    files = pictures_of(truth) | colmap_files(truth, form=form)
+    error = failure(tmp_path / "more", files)
+    assert (error.code, f"more than 9 {what}" in error.message) == ("poses_malformed", True)
+
+
+def test_of_very_many_models_some_are_looked_at_and_that_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(colmap, "_MOST_MODELS", 2)
+    files = dict(PICTURES)
+    for n, indices in enumerate((range(4), range(10), range(5))):
+        files |= colmap_files(TRUTH, folder=f"sparse/{n}/", indices=indices)
+    summary, ctx = ingest(tmp_path, files)
+    assert len(cameras(ctx).images) == 10
+    assert warning_with(summary, "cannot be read: of 3 the first 2")
 
 
 def test_an_empty_list_has_no_poses(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipelines.captures import unpack
 from pipelines.captures.sniff import sniff
 from pipelines.exports.formats.ply import read_ply
 from pipelines.registry import skipped_stages
@@ -233,3 +234,13 @@ def test_the_writer_normalises_by_the_longer_side() -> None:
     camera = opensfm_camera(Intrinsics(48, 64, 32.0, 64.0, 24.0, 40.0))
     assert (camera["focal_x"], camera["focal_y"]) == (0.5, 1.0)
     assert (camera["c_x"], camera["c_y"]) == (0.0, 0.125)
+
+
+@pytest.mark.parametrize(("most", "code"), [(20, "too_large"), (10_000_000, "poses_malformed")])
+def test_very_many_reconstructions_are_refused_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, code: str
+) -> None:
+    monkeypatch.setattr(unpack, "MAX_JSON_PARTS", most)
+    one = json.dumps(opensfm_reconstruction(TRUTH))
+    files = PICTURES | {"reconstruction.json": f"[{one}{',{}' * 1000}]"}
+    assert failure(tmp_path, files).code == code

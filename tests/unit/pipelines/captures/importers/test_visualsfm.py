@@ -67,6 +67,13 @@ def test_without_pictures_it_says_which_it_wants(tmp_path: Path) -> None:
     [
         ("\n10\n", "\n0\n", "poses_missing", "no cameras"),
         ("\n10\n", "\nten\n", "poses_malformed", "Line 3"),
+        ("\n10\n", "\n200001\n", "poses_malformed", "more than 200000 cameras"),
+        (
+            "\n10\n",
+            "\n10" + " " * (1 << 20) + "\n",
+            "poses_malformed",
+            "Line 3 of a.nvm is endless",
+        ),
         ("\n10\n", "\n11\n", "poses_malformed", "Line 15"),
         ("\n40\n", "\n99\n", "poses_malformed", "no point"),
         ("61.5", "nan", "poses_malformed", "Line 4"),
