@@ -13,18 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import DepthMap, agreed, surface_points
+from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
+from pipelines.nerf.stereo.maps import DepthMap, surface_points, votes_of_others
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.views import StereoView
 
 Depths = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
-_MIN_AGREEING = 1
-"""A sensor measures, stereo guesses: one other view is enough, where not more see through."""
+_WITHIN = 2.0
+"""How much farther apart than stereo's depths two of a sensor may be and agree: poses drift."""
 _MIN_SHARED = 1000
 _MOST_SPREAD = 0.05
 _SAME_SCALE = 0.01
+_OUTSIDE = 1.5
 _SAME_SURFACE = 0.05
 
 
@@ -43,7 +45,8 @@ class SensorScale:
 def sensor_scale(stereo: Sequence[DepthMap], sensed: Sequence[Depths | None]) -> SensorScale:
     """Compare the maps of both where both know a pixel.
 
-    Only ratios that hold together count (spread up to 5 %), and only beyond 1 %.
+    Only ratios that hold together count (spread up to 5 %), and only beyond 1 % and one and a half
+    times their spread: less may be stereo's own error.
     """
     ratios = [
         np.log(found.z[both] / z[both])
@@ -54,22 +57,33 @@ def sensor_scale(stereo: Sequence[DepthMap], sensed: Sequence[Depths | None]) ->
         return SensorScale(1.0, None)
     low, middle, high = np.percentile(np.concatenate(ratios), (25.0, 50.0, 75.0))
     spread = float(high - low) / 2.0
-    trusted = spread <= _MOST_SPREAD and abs(middle) > _SAME_SCALE
+    trusted = spread <= _MOST_SPREAD and abs(middle) > max(_SAME_SCALE, _OUTSIDE * spread)
     return SensorScale(float(np.exp(middle)) if trusted else 1.0, spread)
 
 
 def sensor_maps(
     views: Sequence[StereoView], sensed: Sequence[Depths | None], config: StereoConfig
 ) -> list[DepthMap]:
-    """The sensor's maps without what other views' sensors contradict; averaged where they agree."""
-    config = replace(config, min_agreeing=_MIN_AGREEING)
+    """The sensor's maps without what other views' sensors contradict; averaged where they agree.
+
+    A sensor measures, stereo guesses: a depth that nobody else can speak of is kept, as nearly all
+    are where somebody walks through a corridor. Else more must agree than see through it.
+    """
     points = surface_points(views, sensed)
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
+    config = replace(config, agree_within=_WITHIN * config.agree_within)
     maps = [
         np.zeros(view.picture.shape, np.float32) if z is None else z
         for view, z in zip(views, sensed, strict=True)
     ]
-    return [agreed(index, views, maps, neighbours[index], config) for index in range(len(views))]
+    kept = []
+    for index, z in enumerate(maps):
+        votes, sums = votes_of_others(index, views, maps, neighbours[index], config)
+        agreeing = votes[AGREE]
+        believed = (z > 0) & ((agreeing > votes[SEE_THROUGH]) | (votes.sum(axis=0) == 0))
+        mean = np.where(believed, (z + sums) / (1.0 + agreeing), 0.0).astype(np.float32)
+        kept.append(DepthMap(mean, np.where(believed, agreeing, 0).astype(np.uint8)))
+    return kept
 
 
 def merged(stereo: DepthMap, sensor: DepthMap) -> DepthMap:

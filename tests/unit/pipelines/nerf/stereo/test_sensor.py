@@ -45,6 +45,19 @@ def test_a_surface_that_others_see_through_is_dropped() -> None:
     assert (found > 0).mean() > 0.85
 
 
+def test_what_nobody_else_can_speak_of_is_kept() -> None:
+    """Somebody walks through a corridor: half of each picture no other view has depth for."""
+    views, depths = row_of_cameras()
+    halves = [z.copy() for z in depths]
+    for index, z in enumerate(halves):
+        z[: HEIGHT // 2] *= index == 3
+    found = sensor_maps(views, sensed(halves), CONFIG)[3]
+    assert (found.z[: HEIGHT // 2] > 0).mean() > 0.95
+    assert not found.votes[: HEIGHT // 2 - 2].any()
+    assert np.abs(found.z / depths[3] - 1.0)[found.z > 0].max() < 0.04
+    assert (found.votes[HEIGHT // 2 + 2 :] > 0).mean() > 0.9
+
+
 def test_an_image_without_depth_has_an_empty_map() -> None:
     views, depths = row_of_cameras()
     some = sensed(depths)
@@ -67,6 +80,9 @@ def test_a_scale_is_only_changed_on_evidence() -> None:
     maps = as_maps(depths)
     assert sensor_scale(maps, sensed(depths, 1.005)).factor == 1.0, "within what stereo is off"
     generator = np.random.default_rng(0)
+    blurred = [z * np.exp(0.02 * generator.standard_normal(z.shape)) for z in depths]
+    assert sensor_scale(maps, sensed(blurred, 1.015)).factor == 1.0, "no farther off than spread"
+    assert sensor_scale(maps, sensed(blurred, 1.06)).factor == pytest.approx(1 / 1.06, rel=5e-3)
     scattered = [z * generator.uniform(0.5, 1.2, z.shape) for z in depths]
     assert sensor_scale(maps, sensed(scattered)).factor == 1.0, "ratios that do not hold together"
     assert sensor_scale(maps, [None] * len(maps)).spread is None
