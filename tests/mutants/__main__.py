@@ -81,7 +81,11 @@ GROUPS: dict[str, Group] = {
     ),
     "leases": Group(
         ("storage/leases.py",),
-        ("tests/unit/storage/test_jobs.py", "tests/unit/storage/test_states.py"),
+        (
+            "tests/unit/storage/test_jobs.py",
+            "tests/unit/storage/test_retries.py",
+            "tests/unit/storage/test_states.py",
+        ),
     ),
 }
 

@@ -86,6 +86,16 @@ def assert_poses(ctx: StageContext, truth: CamerasFile, atol: float = 1e-9) -> N
         np.testing.assert_allclose(image.world_from_camera, by_file[source], atol=atol)
 
 
+def assert_lenses(ctx: StageContext, truth: CamerasFile, atol: float) -> None:
+    """Every picture has the lens that is true of it, of the same model."""
+    of = {image.file: truth.cameras[image.camera] for image in truth.images}
+    for image, source in zip(cameras(ctx).images, sources(ctx), strict=True):
+        lens, wanted = cameras(ctx).cameras[image.camera], of[source]
+        assert lens.model == wanted.model
+        for key in ("width", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"):
+            assert getattr(lens, key) == pytest.approx(getattr(wanted, key), abs=atol), key
+
+
 def warning_with(summary: Mapping[str, Any], *words: str) -> str:
     """The one warning that holds all the words."""
     (found,) = [text for text in summary["warnings"] if all(word in text for word in words)]

@@ -27,6 +27,7 @@ from tests.sfm_writers import (
 )
 from tests.unit.pipelines.captures.archives import write_zip
 from tests.unit.pipelines.captures.ingesting import (
+    assert_lenses,
     assert_poses,
     cameras,
     failure,
@@ -57,12 +58,7 @@ def test_poses_and_lenses_are_those_that_were_written(tmp_path: Path, folder: st
     assert (summary["num_posed"], summary["metric"], summary["warnings"]) == (10, False, [])
     assert skipped_stages("opensfm") == {"frames", "poses"}
     assert_poses(ctx, TRUTH)
-    of = {image.file: TRUTH.cameras[image.camera] for image in TRUTH.images}
-    for image, source in zip(cameras(ctx).images, sources(ctx), strict=True):
-        lens, wanted = cameras(ctx).cameras[image.camera], of[source]
-        assert lens.model == wanted.model
-        for key in ("width", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"):
-            assert getattr(lens, key) == pytest.approx(getattr(wanted, key), abs=1e-12), key
+    assert_lenses(ctx, TRUTH, 1e-12)
 
 
 def test_its_points_are_kept(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from pipelines.scene.cameras_file import Intrinsics
 from tests.sfm_writers import pictures_of, realitycapture_csv, walked
 from tests.unit.pipelines.captures.archives import write_zip
 from tests.unit.pipelines.captures.ingesting import (
+    assert_lenses,
     assert_poses,
     cameras,
     failure,
@@ -41,12 +42,7 @@ def test_poses_and_lenses_are_those_that_were_written(
     assert skipped_stages("realitycapture") == {"frames", "poses"}
     assert (summary["num_posed"], summary["metric"]) == (10, False)
     assert_poses(ctx, TRUTH)
-    of = {image.file: TRUTH.cameras[image.camera] for image in TRUTH.images}
-    for image, source in zip(cameras(ctx).images, sources(ctx), strict=True):
-        lens, wanted = cameras(ctx).cameras[image.camera], of[source]
-        assert lens.model == wanted.model
-        for key in ("width", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"):
-            assert getattr(lens, key) == pytest.approx(getattr(wanted, key), abs=1e-9), key
+    assert_lenses(ctx, TRUTH, 1e-9)
 
 
 def test_a_camera_without_angles_looks_down_with_north_above(tmp_path: Path) -> None:
