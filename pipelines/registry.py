@@ -34,7 +34,7 @@ def _export_stage(export: Export) -> Stage:
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=6,
+        version=7,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",
@@ -43,7 +43,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="frames",
-        version=2,
+        version=3,
         after=("ingest",),
         reads=("ingest",),
         run="pipelines.stages.frames:run",

@@ -25,6 +25,7 @@ from pipelines.captures.importers import (
     scanner_app,
     stray_scanner,
     video_file,
+    video_files,
     visualsfm,
 )
 from pipelines.captures.unpack import CaptureArchive
@@ -44,6 +45,7 @@ IMPORTERS: tuple[Importer, ...] = (
     visualsfm.IMPORTER,
     llff.IMPORTER,
     rgbd.IMPORTER,
+    video_files.IMPORTER,
     photos.IMPORTER,
 )
 """In order of precedence: the first that claims an upload reads it. `photos` takes any picture."""

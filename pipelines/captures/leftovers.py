@@ -119,7 +119,7 @@ def _known(name: str, head: bytes) -> tuple[str, str]:
     if foreign:
         return f"{foreign} picture", f"{foreign} is not read, convert it to JPEG"
     if video_container(head):
-        return "video", "a video is read where it is sent by itself, not in a .zip"
+        return "video", "videos are read where they are sent without photos or poses"
     program = _program(name, suffix, head)
     if program:
         return "file", f"camera poses of {program} are not read"

@@ -20,7 +20,9 @@ class CaptureRecord:
     kind: one of `catalogue.KINDS`. filename: what the sender called it; a label, never a path.
     sha256: of the bytes that were sent.
     num_images: pictures in `ingest/images`; 0 for a video.
-    video: `VideoInfo` as plain data, for a video.
+    video: `VideoInfo` as plain data, for a film; of several clips that of the longest, with the
+    sums of their lengths and numbers of frames.
+    clips: `pipelines.captures.clips.Clip` as plain data, for a film.
     images: file (relative to `ingest/`), source (name in the archive), width, height, exif (see
     `pipelines.captures.exif`).
     """
@@ -33,6 +35,7 @@ class CaptureRecord:
     images: list[dict[str, Any]] = field(default_factory=list)
     details: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    clips: list[dict[str, Any]] = field(default_factory=list)
 
     def save(self, folder: Path) -> None:
         """Write `capture.json` into the stage's folder."""
@@ -64,3 +67,4 @@ class Found:
     details: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     points: FoundPoints | None = None
+    clips: list[dict[str, Any]] = field(default_factory=list)

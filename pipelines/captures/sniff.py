@@ -30,7 +30,10 @@ from pipelines.captures.magic import (
 )
 from pipelines.errors import CaptureError
 
-_ACCEPTED = "Send a video (MP4, MOV, MKV, WebM, AVI), a .zip of photos, or a .zip of an app export."
+_ACCEPTED = (
+    "Send a video (MP4, MOV, MKV, WebM, AVI), a .zip of photos or of several videos, or a .zip of "
+    "an app export."
+)
 
 
 @dataclass(frozen=True)
@@ -120,12 +123,9 @@ def _sniff_zip(path: Path, limits: ArchiveLimits) -> Sniffed:
 
 def _no_images(heads: Mapping[str, bytes]) -> CaptureError:
     foreign = sorted({kind for head in heads.values() if (kind := foreign_image(head))})
-    videos = sum(video_container(head) is not None for head in heads.values())
     hint = "Put the photos (JPEG, PNG or WebP) into the .zip."
     if foreign:
         hint = f"{', '.join(foreign)} pictures are not supported yet: convert them to JPEG."
-    elif videos:
-        hint = "Send the video by itself, not in a .zip."
     return CaptureError(
         f"The archive has {len(heads)} files, and none is a picture that can be read.",
         code="no_images",

@@ -20,7 +20,13 @@ from pipelines.options import PosesOptions
 from pipelines.sfm.intrinsics import mapping_lens
 from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
 from pipelines.sfm.report import Attempt, Outcome, check_features
-from pipelines.sfm.retrieval import FEATURES_PER_IMAGE, image_vectors, retrieval_pairs
+from pipelines.sfm.retrieval import (
+    FEATURES_PER_IMAGE,
+    Floats,
+    image_vectors,
+    pairs_across,
+    retrieval_pairs,
+)
 from pipelines.sfm.rungs import MAX_ALL_PAIRS, RUNGS, Matches, Rung, Standing
 from pipelines.sfm.source import Source, camera_groups
 from pipelines.sfm.turning import is_turning
@@ -231,11 +237,18 @@ class Ladder:
     def _pairs(self, matcher: str) -> Pairs:
         num, options = len(self._source.files), self._options
         if matcher == "retrieval":
-            vectors = image_vectors(
-                self._reconstructor.features(FEATURES_PER_IMAGE), self._ctx.seed
-            )
-            return retrieval_pairs(vectors, options.retrieval_neighbours)
-        return planned_pairs(num, matcher, options.sequential_overlap)
+            return retrieval_pairs(self._vectors(), options.retrieval_neighbours)
+        clips = self._source.stretches
+        pairs = planned_pairs(num, matcher, options.sequential_overlap, clips)
+        if matcher == "sequential" and len(clips) > 1:
+            # Nothing but looks tells where two clips show the same.
+            found = pairs_across(self._vectors(), clips, options.retrieval_neighbours)
+            pairs = sorted({*pairs, *found})
+        return pairs
+
+    def _vectors(self) -> Floats:
+        """What each image looks like."""
+        return image_vectors(self._reconstructor.features(FEATURES_PER_IMAGE), self._ctx.seed)
 
     def _match(self, wanted: Matches, matcher: str, span: Span) -> None:
         step = f"{wanted.database} {matcher}"

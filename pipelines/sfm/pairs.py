@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 Pairs = list[tuple[int, int]]
 
@@ -43,8 +44,18 @@ def choose_matcher(num: int, matcher: str, *, is_video: bool) -> str:
     return "sequential" if is_video else "retrieval"
 
 
-def planned_pairs(num: int, matcher: str, overlap: int) -> Pairs:
-    """The pairs of `exhaustive` or `sequential` matching."""
+def planned_pairs(
+    num: int, matcher: str, overlap: int, stretches: Sequence[range] | None = None
+) -> Pairs:
+    """The pairs of `exhaustive` or `sequential` matching.
+
+    stretches: indices of the clips of a film; only within one are neighbours neighbours in time.
+    """
     if matcher == "exhaustive":
         return exhaustive_pairs(num)
-    return sorted({*sequential_pairs(num, overlap), *spaced_pairs(num)})
+    along = {
+        (clip.start + i, clip.start + j)
+        for clip in stretches or [range(num)]
+        for i, j in sequential_pairs(len(clip), overlap)
+    }
+    return sorted(along | set(spaced_pairs(num)))

@@ -94,6 +94,22 @@ def retrieval_pairs(vectors: Floats, neighbours: int) -> Pairs:
     return sorted(pairs | _spanning_tree(alike))
 
 
+def pairs_across(vectors: Floats, stretches: Sequence[range], neighbours: int) -> Pairs:
+    """Each image with those most like it among the images of all other clips.
+
+    vectors: [N, K * D] unit. stretches: indices of each clip, N in all. Returns sorted pairs.
+    """
+    alike = vectors @ vectors.T
+    for clip in stretches:
+        alike[clip.start : clip.stop, clip.start : clip.stop] = -np.inf
+    pairs = set()
+    for i, row in enumerate(alike):
+        others = np.flatnonzero(np.isfinite(row))
+        nearest = others[np.argsort(-row[others], kind="stable")[:neighbours]]
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in nearest}
+    return sorted(pairs)
+
+
 def _spanning_tree(alike: Floats) -> set[tuple[int, int]]:
     """Edges (i, j), i < j, of a tree over all images that are most alike (Prim's algorithm)."""
     num = len(alike)

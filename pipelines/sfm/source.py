@@ -34,6 +34,8 @@ class Source:
     root: folder that `files` are relative to. files: paths with "/". timestamps_s: seconds of the
     film, None for photos and for frames whose time the file does not say. is_video: whether
     neighbours in the list are neighbours in time. exif: what the record says of each photo.
+    clips: of a film, the clip that each frame is of, ascending; neighbours of one clip only are
+    neighbours in time.
     """
 
     root: Path
@@ -41,6 +43,14 @@ class Source:
     timestamps_s: tuple[float | None, ...]
     is_video: bool
     exif: tuple[Mapping[str, Any], ...] = ()
+    clips: tuple[int, ...] = ()
+
+    @property
+    def stretches(self) -> list[range]:
+        """Indices of the frames of each clip in turn; all, where there are no clips."""
+        clips = self.clips or (0,) * len(self.files)
+        edges = [i for i in range(1, len(clips)) if clips[i] != clips[i - 1]]
+        return [range(a, b) for a, b in zip([0, *edges], [*edges, len(clips)], strict=True)]
 
     @property
     def paths(self) -> list[Path]:
@@ -59,7 +69,8 @@ def read_source(workspace: Workspace) -> Source:
         frames = json.loads(listing.read_text("utf-8"))["frames"]
         files = tuple(str(frame["file"]) for frame in frames)
         times = tuple(_seconds(frame["timestamp_s"]) for frame in frames)
-        source = Source(root, files, times, is_video=True)
+        clips = tuple(int(frame.get("clip", 0)) for frame in frames)
+        source = Source(root, files, times, is_video=True, clips=clips)
     else:
         capture = json.loads((root / "capture.json").read_text("utf-8"))
         files = tuple(str(image["file"]) for image in capture["images"])
@@ -84,12 +95,12 @@ def read_source(workspace: Workspace) -> Source:
 def camera_groups(source: Source, lens: str) -> tuple[CameraGroup, ...]:
     """Images that share a lens, each with the COLMAP model to fit and the focal length EXIF gives.
 
-    Frames of a video are one group. Photos are grouped by size and by what EXIF says of camera and
+    Frames of a clip are one group. Photos are grouped by size and by what EXIF says of camera and
     focal length. lens: the model wanted; groups of few images get a simpler one than OPENCV.
     Raises CaptureError (image_undecodable) for a file that is no picture.
     """
     if source.is_video:
-        return (_group(range(len(source.files)), lens, None),)
+        return tuple(_group(stretch, lens, None) for stretch in source.stretches)
     members: dict[tuple[Any, ...], list[int]] = {}
     focal_px: dict[tuple[Any, ...], float | None] = {}
     exif = source.exif or ({},) * len(source.files)

@@ -1,8 +1,10 @@
-"""Stage `frames`: the sharpest frame of each even time window of a video.
+"""Stage `frames`: the sharpest frame of each even time window of a film.
 
-Writes `images/frame_00001.jpg`, ... (upright, SDR, reduced) and `frames.json`:
-`{width, height, num_source_frames, frames: [{file, timestamp_s, source_frame_index, sharpness}]}`.
-The video is decoded once; of each window only the best frame so far is held.
+Writes `images/frame_00001.jpg`, ... (upright, SDR, reduced) and `frames.json`: `{width, height,
+num_source_frames, warnings, clips: [{name, offset_s, duration_s, width, height, num_frames,
+num_source_frames}], frames: [{file, clip, timestamp_s, source_frame_index, sharpness}]}`.
+Times of several clips run on from one to the next: `offset_s` is where a clip's own begin.
+Each clip is decoded once; of each window only the best frame so far is held.
 """
 
 from __future__ import annotations
@@ -10,10 +12,13 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipelines.captures.archive_rules import shown
+from pipelines.captures.clips import Clip, clip_file
 from pipelines.captures.hdr import TRANSFERS
 from pipelines.captures.minimum import MIN_IMAGES
 from pipelines.captures.record import CaptureRecord
@@ -28,21 +33,27 @@ from pipelines.options import FramesOptions
 from pipelines.stage import StageContext
 
 FRAMES_JSON = "frames.json"
+MIN_PER_CLIP = 8
+"""Frames that a short clip gets beside long ones, as far as it has so many."""
 
 
 @dataclass
 class _Windows:
-    """Keeps the sharpest frame of each window and writes it once the window has passed.
+    """Keeps the sharpest frame of each window of a clip and writes it once the window has passed.
 
-    num_windows: 0 to keep every frame. start_s, length_s: of a window's grid.
+    rows: of all clips so far, to which the clip's are added. clip: its number. offset_s: what its
+    times are counted from. num_windows: 0 to keep every frame. start_s, length_s: of a window's
+    grid, by the clip's own times.
     """
 
     out: Path
     jpeg_quality: int
+    rows: list[dict[str, Any]]
+    clip: int
+    offset_s: float
     num_windows: int
     start_s: float
     length_s: float
-    rows: list[dict[str, Any]] = field(default_factory=list)
     num_seen: int = 0
     _best: Frame | None = None
     _best_sharpness: float = -1.0
@@ -69,7 +80,10 @@ class _Windows:
         self.rows.append(
             {
                 "file": file,
-                "timestamp_s": round(frame.time_s, 6) if math.isfinite(frame.time_s) else None,
+                "clip": self.clip,
+                "timestamp_s": round(self.offset_s + frame.time_s, 6)
+                if math.isfinite(frame.time_s)
+                else None,
                 "source_frame_index": frame.index,
                 "sharpness": round(self._best_sharpness, 3),
             }
@@ -89,101 +103,193 @@ def run(options: FramesOptions, ctx: StageContext) -> dict[str, Any]:
     Raises CaptureError: video_undecodable, too_few_images; ToolError; Cancelled.
     """
     record = CaptureRecord.load(ctx.workspace.stage("ingest"))
-    if record.video is None:
+    clips = [Clip(**clip) for clip in record.clips]
+    if not clips:
         raise CaptureError(
             f"A capture of kind {record.kind} has no video to take frames from.",
             code="no_video_stream",
             hint="Skip the stage `frames` for this capture.",
         )
-    video = record.video
-    warnings: list[str] = []
-    start_s = float(record.details.get("start_s", 0.0))
-    length_s = max(float(video["duration_s"]) - start_s, 1e-6)
-    keep_all = int(video["num_frames"]) <= options.num_frames
-    windows = _Windows(
-        out=ctx.out,
-        jpeg_quality=options.jpeg_quality,
-        num_windows=0 if keep_all else options.num_frames,
-        start_s=start_s,
-        length_s=length_s / options.num_frames,
-    )
-    width, height = reduced_size(video["width"], video["height"], options.long_side_px)
-    plan = DecodePlan(
-        width=width,
-        height=height,
-        hdr=str(video["hdr"]),
-        matrix=video.get("matrix"),
-        start_s=start_s,
-        step_s=_step(video, options, length_s),
-    )
     (ctx.out / "images").mkdir(parents=True, exist_ok=True)
-    num_decoded = _decode(plan, windows, ctx, start_s, length_s)
-    _check(windows, num_decoded, int(video["num_frames"]), warnings)
-    _write(ctx.out, plan, windows, num_decoded, warnings)
+    rows: list[dict[str, Any]] = []
+    read: list[_Read] = []
+    whole_s = sum(clip.end_s for clip in clips)
+    for number, (clip, share) in enumerate(
+        zip(clips, shared_frames(clips, options.num_frames), strict=True)
+    ):
+        offset_s = sum(before.end_s for before in clips[:number])
+        scale = _Scale(ctx, offset_s, whole_s)
+        read.append(_read_clip(clip, number, share, rows, options, scale))
+    num_decoded = sum(one.num_decoded for one in read)
+    warnings = _check(rows, clips, read)
+    _write(ctx.out, clips, read, rows, warnings)
     for warning in warnings:
         ctx.logger.warning("%s", warning)
-    ctx.progress(1.0, f"{len(windows.rows)} frames kept of {num_decoded}")
+    ctx.progress(1.0, f"{len(rows)} frames kept of {num_decoded}")
     return {
-        "num_frames": len(windows.rows),
+        "num_frames": len(rows),
         "num_source_frames": num_decoded,
-        "num_candidates": windows.num_seen,
-        "width": width,
-        "height": height,
-        "tone_mapped": video["hdr"] in TRANSFERS,
+        "num_candidates": sum(one.num_seen for one in read),
+        "num_clips": len(clips),
+        "width": read[0].plan.width,
+        "height": read[0].plan.height,
+        "tone_mapped": any(clip.video["hdr"] in TRANSFERS for clip in clips),
         "warnings": warnings,
     }
 
 
-def _step(video: dict[str, Any], options: FramesOptions, length_s: float) -> float:
-    """Length of the cells of which at most one frame is looked at; 0 where all frames are."""
-    wanted = options.num_frames * options.candidates_per_frame
-    return length_s / wanted if int(video["num_frames"]) > wanted else 0.0
+def shared_frames(clips: Sequence[Clip], wanted: int) -> list[int]:
+    """How many frames each clip gives, by its length, MIN_PER_CLIP or all it has at least.
+
+    Their sum is `wanted`, but for what clips have not, and for what the least takes of many clips.
+    """
+    least = [min(MIN_PER_CLIP, clip.num_frames) for clip in clips]
+    most = [clip.num_frames for clip in clips]
+    shares = [0.0] * len(clips)
+    open_, left = set(range(len(clips))), float(wanted)
+    while open_:
+        length_s = sum(clips[i].length_s for i in open_)
+        for i in open_:
+            shares[i] = left * clips[i].length_s / length_s
+        # What is bounded is settled first, those that get too little before those that have less.
+        bounded = {i for i in open_ if shares[i] < least[i]} or {
+            i for i in open_ if shares[i] > most[i]
+        }
+        if not bounded:
+            break
+        for i in bounded:
+            shares[i] = float(min(max(shares[i], least[i]), most[i]))
+            left -= shares[i]
+        left = max(left, 0.0)
+        open_ -= bounded
+    ends = [round(sum(shares[: i + 1])) for i in range(len(clips))]
+    return [end - start for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def _decode(
-    plan: DecodePlan, windows: _Windows, ctx: StageContext, start_s: float, length_s: float
-) -> int:
-    begun = time.monotonic()
+@dataclass(frozen=True)
+class _Scale:
+    """Progress over all clips, which follow one another by their times."""
+
+    ctx: StageContext
+    offset_s: float
+    whole_s: float
+    begun: float = field(default_factory=time.monotonic)
+
+    def report(self, time_s: float, num_kept: int) -> None:
+        """Tell how far a clip has been read, by its own time."""
+        known = time_s if math.isfinite(time_s) else 0.0
+        fraction = (self.offset_s + known) / max(self.whole_s, 1e-6)
+        here = known / max(self.whole_s, 1e-6)
+        elapsed_s = time.monotonic() - self.begun
+        eta_s = elapsed_s * (1 - fraction) / here if here > 0.02 else None
+        self.ctx.progress(min(fraction, 0.999), f"{num_kept} frames kept", eta_s)
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What came of a clip."""
+
+    plan: DecodePlan
+    offset_s: float
+    num_decoded: int
+    num_seen: int
+    num_kept: int
+
+
+def _read_clip(
+    clip: Clip,
+    number: int,
+    share: int,
+    rows: list[dict[str, Any]],
+    options: FramesOptions,
+    scale: _Scale,
+) -> _Read:
+    """Decode a clip and add its best frames to the rows. share: how many."""
+    ctx = scale.ctx
+    width, height = reduced_size(clip.video["width"], clip.video["height"], options.long_side_px)
+    windows = _Windows(
+        out=ctx.out,
+        jpeg_quality=options.jpeg_quality,
+        rows=rows,
+        clip=number,
+        offset_s=scale.offset_s,
+        num_windows=0 if clip.num_frames <= share else share,
+        start_s=clip.start_s,
+        length_s=clip.length_s / share,
+    )
+    plan = DecodePlan(
+        width=width,
+        height=height,
+        hdr=str(clip.video["hdr"]),
+        matrix=clip.video.get("matrix"),
+        start_s=clip.start_s,
+        step_s=_step(clip, share * options.candidates_per_frame),
+    )
+    before = len(rows)
 
     def on_frame(frame: Frame) -> None:
         windows.take(frame)
-        fraction = (frame.time_s - start_s) / length_s if math.isfinite(frame.time_s) else 0.0
-        elapsed_s = time.monotonic() - begun
-        eta_s = elapsed_s * (1 - fraction) / fraction if fraction > 0.02 else None
-        ctx.progress(min(fraction, 0.999), f"{len(windows.rows)} frames kept", eta_s)
+        scale.report(frame.time_s, len(rows))
 
-    num_decoded = decode(ctx.workspace.capture_file, plan, ctx, on_frame)
+    with clip_file(ctx.workspace.capture_file, clip, ctx.out) as file:
+        num_decoded = decode(file, plan, ctx, on_frame)
     windows.flush()
-    return num_decoded
+    return _Read(plan, scale.offset_s, num_decoded, windows.num_seen, len(rows) - before)
 
 
-def _check(windows: _Windows, num_decoded: int, num_expected: int, warnings: list[str]) -> None:
+def _step(clip: Clip, wanted: int) -> float:
+    """Length of the cells of which at most one frame is looked at; 0 where all frames are."""
+    return clip.length_s / wanted if clip.num_frames > wanted else 0.0
+
+
+def _check(rows: list[dict[str, Any]], clips: Sequence[Clip], read: Sequence[_Read]) -> list[str]:
+    """Warnings. Raises CaptureError where the film is not enough."""
+    num_decoded = sum(one.num_decoded for one in read)
     if num_decoded == 0:
         raise CaptureError(
             "Not one frame of the video can be decoded.",
             code="video_undecodable",
             hint="Check that it plays, or export it again as MP4 with H.264 or HEVC.",
         )
-    if len(windows.rows) < MIN_IMAGES:
+    if len(rows) < MIN_IMAGES:
         raise CaptureError(
-            f"The video gave {len(windows.rows)} frames; at least {MIN_IMAGES} are needed.",
+            f"The video gave {len(rows)} frames; at least {MIN_IMAGES} are needed.",
             code="too_few_images",
             hint="Film for 10 seconds or more, moving around the subject.",
         )
-    if num_decoded < 0.9 * num_expected:
-        warnings.append(
-            f"{num_decoded} of {num_expected} frames could be decoded; the video is damaged."
-        )
+    return [
+        f"{one.num_decoded} of {clip.num_frames} frames"
+        + (f' of "{shown(clip.name)}"' if len(clips) > 1 else "")
+        + " could be decoded; the video is damaged."
+        for clip, one in zip(clips, read, strict=True)
+        if one.num_decoded < 0.9 * clip.num_frames
+    ]
 
 
 def _write(
-    out: Path, plan: DecodePlan, windows: _Windows, num_decoded: int, warnings: list[str]
+    out: Path,
+    clips: Sequence[Clip],
+    read: Sequence[_Read],
+    rows: list[dict[str, Any]],
+    warnings: list[str],
 ) -> None:
     payload = {
-        "width": plan.width,
-        "height": plan.height,
-        "num_source_frames": num_decoded,
+        "width": read[0].plan.width,
+        "height": read[0].plan.height,
+        "num_source_frames": sum(one.num_decoded for one in read),
         "warnings": warnings,
-        "frames": windows.rows,
+        "clips": [
+            {
+                "name": clip.name,
+                "offset_s": round(one.offset_s, 6),
+                "duration_s": clip.end_s,
+                "width": one.plan.width,
+                "height": one.plan.height,
+                "num_frames": one.num_kept,
+                "num_source_frames": one.num_decoded,
+            }
+            for clip, one in zip(clips, read, strict=True)
+        ],
+        "frames": rows,
     }
     (out / FRAMES_JSON).write_text(json.dumps(payload, indent=1), "utf-8")

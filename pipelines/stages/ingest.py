@@ -2,7 +2,7 @@
 
 Writes `capture.json` (always), `images/` (photos and app exports), `masks/`, `depth/` and
 `cameras.json` (captures with poses), `points.ply` (where sparse points came with those). A video
-stays where it is: `frames` reads the upload.
+stays where it is: `frames` reads the upload, also where it is a .zip of several.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 
 from pipelines.captures.archive_rules import ArchiveLimits
 from pipelines.captures.catalogue import importer_of, load_reader
+from pipelines.captures.clips import read_film, read_films
 from pipelines.captures.contents import PosedPictures
-from pipelines.captures.importers import video
 from pipelines.captures.leftovers import as_details, leftover_warnings, leftovers
 from pipelines.captures.photos import write_photos
 from pipelines.captures.posed import write_posed
@@ -56,6 +56,7 @@ def run(options: IngestOptions, ctx: StageContext) -> dict[str, Any]:
         images=found.images,
         details=found.details,
         warnings=found.warnings,
+        clips=found.clips,
     )
     record.save(ctx.out)
     for warning in record.warnings:
@@ -74,7 +75,7 @@ def _read(sniffed: Sniffed, path: Path, options: IngestOptions, ctx: StageContex
     """What is in the upload, checked and written, with a word on what was not used."""
     importer = importer_of(sniffed.kind)
     if importer.brings == "film":
-        return video.read(path, options, ctx)
+        return (read_film if sniffed.kind == "video" else read_films)(path, options, ctx)
     limits = ArchiveLimits(max_unpacked_bytes=options.max_unpacked_bytes)
     with CaptureArchive(path, limits) as archive:
         contents = load_reader(importer)(archive, sniffed.claim)

@@ -1,6 +1,6 @@
 """A video: is it whole, can it be decoded, how long and how large is it.
 
-Nothing is copied or converted here; `pipelines.stages.frames` reads the upload itself.
+Nothing is copied or converted here. `pipelines.captures.clips` tells which videos a capture has.
 """
 
 from __future__ import annotations
@@ -8,9 +8,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from pipelines.captures.minimum import MIN_IMAGES
-from pipelines.captures.record import Found
 from pipelines.errors import CaptureError, ToolError
 from pipelines.options import IngestOptions
 from pipelines.stage import StageContext
@@ -89,11 +88,32 @@ def _ticks(*stamps: bytes, default: int) -> int:
     return default
 
 
-def read(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
-    """Check the video at `path`.
+@dataclass(frozen=True)
+class Checked:
+    """A video that can be used. info: with its true length and number of frames."""
 
-    Raises CaptureError: video_truncated, no_video_stream, video_undecodable, video_too_long,
-    too_large, too_few_images, projection_unsupported.
+    info: VideoInfo
+    packets: Scan
+
+    @property
+    def start_s(self) -> float:
+        """When its first frame is shown."""
+        return round(self.packets.times_s[0], 6)
+
+    def details(self) -> dict[str, Any]:
+        """For the record."""
+        return _details(self.info, self.packets)
+
+    def warnings(self) -> list[str]:
+        """What its sender should know."""
+        return _warnings(self.info)
+
+
+def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int) -> Checked:
+    """Check the video at `path`. minimum: fewest frames.
+
+    Raises CaptureError: video_truncated, no_video_stream, video_undecodable, too_large,
+    too_few_images, projection_unsupported.
     """
     ctx.progress(0.0, "Reading the video's index")
     info = probe(path)
@@ -115,22 +135,16 @@ def read(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
     ctx.progress(0.7, "Decoding the first frames")
     _try_decoding(path, ctx)
     num_frames = len(packets.times_s)
-    if num_frames < MIN_IMAGES:
+    if num_frames < max(minimum, 1):
         raise CaptureError(
-            f"The video has {num_frames} frames; at least {MIN_IMAGES} are needed.",
+            f"The video has {num_frames} frames; at least {minimum} are needed.",
             code="too_few_images",
             hint="Film for 10 seconds or more, moving around the subject.",
         )
     duration_s = packets.duration_s
-    if duration_s > options.max_duration_s:
-        raise CaptureError(
-            f"The video is {duration_s:.0f} s long; {options.max_duration_s:.0f} s are allowed.",
-            code="video_too_long",
-            hint="Cut the video, or raise ingest.max_duration_s.",
-        )
     fps = info.fps or (num_frames / duration_s if duration_s > 0 else None)
     info = replace(info, num_frames=num_frames, duration_s=round(duration_s, 6), fps=fps)
-    return Found(video=info.as_dict(), details=_details(info, packets), warnings=_warnings(info))
+    return Checked(info, packets)
 
 
 def _check_size(info: VideoInfo, options: IngestOptions) -> None:

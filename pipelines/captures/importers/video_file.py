@@ -1,6 +1,6 @@
 """A video, sent by itself: the container's first bytes say so.
 
-`pipelines.captures.importers.video` checks it, the stage `frames` reads it.
+`pipelines.captures.clips` checks it, the stage `frames` reads it.
 """
 
 from __future__ import annotations

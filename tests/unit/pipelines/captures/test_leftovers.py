@@ -93,7 +93,7 @@ def test_videos_and_unreadable_formats_in_an_archive_are_told(tmp_path: Path) ->
         "a.dng": b"II*\x00" + bytes(40),
     }
     clip, raw = sorted(told(tmp_path, files), key=lambda text: "raw" in text)
-    assert clip.startswith("1 video (clip.mp4) was not used: a video is read where")
+    assert clip.startswith("1 video (clip.mp4) was not used: videos are read where")
     assert raw.startswith("1 TIFF or camera raw picture (a.dng) was not used: ")
 
 

@@ -47,3 +47,13 @@ def test_planned_pairs_of_a_film_are_few_and_close_loops() -> None:
     pairs = planned_pairs(300, "sequential", 10)
     assert len(pairs) < 5000
     assert {(0, 1), (0, 299)} <= set(pairs)
+
+
+def test_neighbours_in_time_are_of_one_clip() -> None:
+    """With two clips of 20 only the evenly spaced ones pair the end of one with the next."""
+    clips = [range(20), range(20, 40)]
+    pairs = set(planned_pairs(40, "sequential", 3, clips))
+    assert {(0, 1), (0, 3), (17, 19), (20, 21), (36, 39)} <= pairs
+    joining = {(i, j) for i, j in pairs if i < 20 <= j}
+    assert joining == {(i, j) for i, j in spaced_pairs(40) if i < 20 <= j}
+    assert pairs < set(planned_pairs(40, "exhaustive", 3, clips))

@@ -9,6 +9,7 @@ from pipelines.sfm.retrieval import (
     image_vectors,
     learn_words,
     nearest_words,
+    pairs_across,
     retrieval_pairs,
 )
 
@@ -123,3 +124,18 @@ def test_words_are_the_means_of_what_is_nearest_to_them() -> None:
     for word in range(3):
         mine = samples[np.array(slow) == word]
         np.testing.assert_allclose(words[word], mine.mean(axis=0), atol=1.0)
+
+
+def test_each_image_is_paired_with_its_like_of_the_other_clips_alone() -> None:
+    """Of one walk every third image is a clip: what is most like an image is of its neighbours."""
+    images, starts = features_of_a_walk(60)
+    order = np.argsort(starts)
+    clips = [range(0, 20), range(20, 40), range(40, 60)]
+    arranged = np.concatenate([order[offset::3] for offset in range(3)])
+    pairs = pairs_across(image_vectors([images[i] for i in arranged]), clips, neighbours=3)
+    clip_of = np.arange(60) // 20
+    assert all(i < j and clip_of[i] != clip_of[j] for i, j in pairs)
+    assert {index for pair in pairs for index in pair} == set(range(60))
+    gaps = distance_around(starts[arranged])
+    assert np.mean([gaps[pair] < SEEN / 2 for pair in pairs]) > 0.9
+    assert pairs_across(np.ones((3, 4), np.float32), [range(3)], 5) == []

@@ -173,6 +173,20 @@ def test_frames_without_a_time_are_taken_in_their_order(tmp_path: Path) -> None:
     assert source.is_video
 
 
+def test_the_frames_of_each_clip_are_a_lens_and_a_sequence_of_their_own(tmp_path: Path) -> None:
+    folder = tmp_path / "frames" / "images"
+    folder.mkdir(parents=True)
+    rows = []
+    for number, clip in enumerate((0, 0, 1, 1, 1)):
+        Image.new("RGB", (8, 8)).save(folder / f"{number}.jpg")
+        rows.append({"file": f"images/{number}.jpg", "timestamp_s": number / 10, "clip": clip})
+    (tmp_path / "frames" / "frames.json").write_text(json.dumps({"frames": rows}), "utf-8")
+    (tmp_path / "frames" / "manifest.json").write_text("{}", "utf-8")
+    source = read_source(Workspace(tmp_path))
+    assert source.stretches == [range(2), range(2, 5)]
+    assert [group.indices for group in camera_groups(source, "RADIAL")] == [(0, 1), (2, 3, 4)]
+
+
 @pytest.mark.captures
 @pytest.mark.skipif(
     "NERFWORKS_CAPTURES" not in os.environ,
