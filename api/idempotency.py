@@ -83,7 +83,7 @@ def do_once(
         return KeptAnswer(status, view.model_dump_json(), location)
 
     if once.key is None:
-        with services.database.session_scope(actor_of(once.caller)) as session:
+        with services.database.session_scope(actor_of(once.caller), step="create") as session:
             answer = answer_in(session)
         return _response(answer, is_replayed=False)
     scope = scope_of(once.caller, once.call, once.key)
@@ -91,7 +91,7 @@ def do_once(
     if isinstance(held, KeptAnswer):
         return _response(held, is_replayed=True)
     try:
-        with services.database.session_scope(actor_of(once.caller)) as session:
+        with services.database.session_scope(actor_of(once.caller), step="create") as session:
             answer = answer_in(session)
             keep(session, scope, held, answer)
     except BaseException:

@@ -38,6 +38,7 @@ from sqlalchemy.engine import Connection
 from sqlalchemy.orm import Session, sessionmaker
 
 from storage.postgres import bound
+from storage.steps import reached
 
 BUSY_TIMEOUT_S = 30.0
 STATEMENT_S = 15.0
@@ -199,15 +200,22 @@ class Database:
         )
 
     @contextmanager
-    def session_scope(self, actor: str | None = None) -> Iterator[Session]:
+    def session_scope(
+        self, actor: str | None = None, *, step: str | None = None
+    ) -> Iterator[Session]:
         """A session that may write. Commits when the block ends, rolls back when it raises.
 
-        actor: who changes something, for the record.
+        actor: who changes something, for the record. step: the operation in `storage.steps` that
+        this transaction is.
         """
         with self._write.begin() as session:
             if actor is not None:
                 name_actor(session, actor)
             yield session
+            if step is not None:
+                reached(f"{step}.commit")
+        if step is not None:
+            reached(f"{step}.committed")
 
     @contextmanager
     def read_scope(self) -> Iterator[Session]:

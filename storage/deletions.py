@@ -15,6 +15,7 @@ from storage.db import Database
 from storage.errors import ObjectStoreError
 from storage.models import PendingDeletion
 from storage.objects import ObjectStore
+from storage.steps import reached
 
 MAX_FAILURES = 3
 """So many in a row, and the store is taken for away until the next round."""
@@ -36,10 +37,11 @@ def drain_deletions(database: Database, store: ObjectStore, limit: int = 100) ->
         try:
             store.delete_prefix(prefix)
             failures = 0
+            reached("erase.deleted")
         except ObjectStoreError as error:
             _log.warning("could not delete %s yet: %s", prefix, error)
             failures += 1
-        with database.session_scope() as session:
+        with database.session_scope(step="erase") as session:
             gone = session.scalar(
                 delete(PendingDeletion)
                 .where(PendingDeletion.id == row_id)

@@ -59,7 +59,7 @@ def claim(
     """
     token = secrets.token_hex(8)
     try:
-        with database.session_scope() as session:
+        with database.session_scope(step="hold") as session:
             moment = when or now(session)
             row = session.get(IdempotentCall, scope, with_for_update=True)
             if row is None:

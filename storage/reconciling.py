@@ -47,7 +47,7 @@ def sweep_orphans(
     found: list[str] = []
     old = (prefix for prefix, newest in _folders(store) if newest < edge)
     while batch := [*islice(old, BATCH)]:
-        with database.session_scope("sweep") as session:
+        with database.session_scope("sweep", step="sweep") as session:
             spoken_for = _spoken_for(session, batch)
             orphans = [prefix for prefix in batch if prefix not in spoken_for]
             session.add_all(PendingDeletion(prefix=prefix, created_at=when) for prefix in orphans)

@@ -22,6 +22,7 @@ from storage.db import Database
 from storage.errors import LostLeaseError, ObjectStoreError, StorageError
 from storage.leases import save_checkpoint
 from storage.objects import ObjectStore
+from storage.steps import reached
 from worker.transfer import upload_folder
 
 _log = logging.getLogger("nerfworks.worker")
@@ -120,10 +121,17 @@ class CheckpointUploader:
         self._number += 1
         prefix = keys.checkpoint_prefix(claim.job_id, claim.name, claim.token, self._number)
         try:
-            upload_folder(self._store, snapshot.folder, prefix, self._check, workers=self._workers)
+            upload_folder(
+                self._store,
+                snapshot.folder,
+                prefix,
+                self._check,
+                workers=self._workers,
+                step="checkpoint",
+            )
             if not snapshot.is_intact():
                 raise ObjectStoreError(f"{claim.name} wrote into files instead of replacing them")
-            with self._database.session_scope() as session:
+            with self._database.session_scope(step="checkpoint") as session:
                 old = save_checkpoint(session, claim, prefix)
         except SQLAlchemyError:
             # The COMMIT may have been applied: nobody knows which of the two the row names, so both
@@ -134,3 +142,4 @@ class CheckpointUploader:
             raise
         if old is not None:
             self._store.delete_prefix(old)
+            reached("checkpoint.replaced")

@@ -48,7 +48,7 @@ def publish_failure(
             inputs = stage_work(session, claim).inputs
         manifests = {name: found.manifest for name, found in inputs.items()}
         write_failed_report(folder / REPORT, workspace, manifests, claim.name, error)
-        upload_folder(store, folder, prefix, lambda: None, workers=1)
+        upload_folder(store, folder, prefix, lambda: None, workers=1, step="report")
         return FailureReport(prefix, list_files(folder))
     except (StorageError, SQLAlchemyError, OSError, ValueError, KeyError, TypeError) as problem:
         _log.warning("%s: no report of the failure: %s", claim.stage_id, problem)

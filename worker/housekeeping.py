@@ -157,7 +157,8 @@ class Housekeeping:
 
     def reap(self) -> None:
         """Take back stages whose leases ran out; not at once where we ourselves were away."""
-        with self._database.session_scope(f"reaper:{socket.gethostname()}") as session:
+        actor = f"reaper:{socket.gethostname()}"
+        with self._database.session_scope(actor, step="reap") as session:
             moment = now(session)
             ready = reap_expired(session, moment) if self._grace.is_over(moment) else []
         if ready:

@@ -119,7 +119,7 @@ class LeaseKeeper:
             moved, self._moved = self._moved, False
         fraction, message, eta_s = progress or (None, None, None)
         try:
-            with self._database.session_scope() as session:
+            with self._database.session_scope(step="beat") as session:
                 reply = heartbeat(
                     session,
                     self._claim,

@@ -37,6 +37,7 @@ from storage.leases import (
 from storage.objects import ObjectStore
 from storage.queries import StageWork, stage_work
 from storage.runs import RunEnd
+from storage.steps import reached
 from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.disk import free_bytes
 from worker.failures import publish_failure
@@ -221,6 +222,7 @@ class Runner:
             return []
         _log.info("%s: succeeded", claim.stage_id)
         self._discard(claim, keys.stage_prefix(claim.job_id, claim.name), keep=prefix)
+        reached("finish.tidied")
         return ready
 
     def _guard_of(self, keeper: LeaseKeeper) -> Callable[[], None]:
@@ -251,6 +253,7 @@ class Runner:
             self._store, workspace, stage.name, work.checkpoint_prefix, guard, workers=workers
         )
         laps.end("fetch_s")
+        reached("run.fetched")
         uploader = CheckpointUploader(
             self._database, self._store, claim, self._lease_guard(keeper), workers=workers
         )
@@ -263,7 +266,9 @@ class Runner:
         finally:
             limit_s = self._settings.cancel_grace_s if self._shutdown.is_set() else CHECKPOINT_END_S
             uploader.close(finish=finish, timeout_s=limit_s)
-        upload_folder(self._store, workspace.stage(stage.name), prefix, guard, workers=workers)
+        reached("run.done")
+        folder = workspace.stage(stage.name)
+        upload_folder(self._store, folder, prefix, guard, workers=workers, step="publish")
         laps.end("store_s")
         return {**manifest, "timings": {**manifest["timings"], **laps.seconds}}
 
@@ -373,6 +378,7 @@ class Runner:
                 uploader.offer(Snapshot(Path(message["path"]), message["files"]))
             elif kind == "begun":
                 laps.end("start_s")
+                reached("run.begun")
             elif kind == "done":
                 laps.end("run_s")
                 manifest: dict[str, Any] = message["manifest"]
@@ -460,7 +466,7 @@ class Runner:
         deadline = time.monotonic() + self._settings.lease_s
         while True:
             try:
-                with self._database.session_scope() as session:
+                with self._database.session_scope(step="finish") as session:
                     return operation(session)
             except SQLAlchemyError as error:
                 _log.warning("the end of a stage waits for the database: %s", error)

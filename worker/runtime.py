@@ -263,7 +263,7 @@ class WorkerRuntime:
         has_gpu = self.identity.has_gpu and self._gpu.acquire(blocking=False)
         claim: Claim | None = None
         try:
-            with self._database.session_scope() as session:
+            with self._database.session_scope(step="claim") as session:
                 served = self._served(session)
                 if self.identity.has_gpu and not has_gpu:
                     served = [name for name in served if name != RESOURCE_GPU]

@@ -18,6 +18,7 @@ from pipelines.workspace import MANIFEST, Workspace
 from storage.errors import ObjectStoreError
 from storage.objects import ObjectStore
 from storage.queries import StageInput, StageWork
+from storage.steps import reached
 from worker.locks import folder_lock
 
 Guard = Callable[[], None]
@@ -39,14 +40,22 @@ def _run_all(jobs: Iterable[Callable[[], None]], workers: int) -> None:
 
 
 def upload_folder(
-    store: ObjectStore, folder: Path, prefix: str, guard: Guard, *, workers: int
+    store: ObjectStore, folder: Path, prefix: str, guard: Guard, *, workers: int, step: str
 ) -> None:
-    """Upload all files below a folder; its manifest, if any, last."""
+    """Upload all files below a folder; its manifest, if any, last.
+
+    step: the operation in `storage.steps` that this is.
+    """
+
+    def check(count: int) -> None:
+        guard()
+        reached(f"{step}.bytes")
 
     def put(name: str) -> Callable[[], None]:
         def move() -> None:
             guard()
-            store.put_file(prefix + name, folder / name, lambda count: guard())
+            store.put_file(prefix + name, folder / name, check)
+            reached(f"{step}.put")
 
         return move
 
@@ -56,6 +65,7 @@ def upload_folder(
     _run_all([put(name) for name in names if name != MANIFEST], workers)
     if MANIFEST in names:
         put(MANIFEST)()
+    reached(f"{step}.stored")
 
 
 def download_folder(

@@ -14,6 +14,7 @@ from pipelines.captures.sniff import sniff
 from storage import records
 from storage.keys import capture_content, capture_prefix
 from storage.models import new_id
+from storage.steps import reached
 
 
 def keep(services: Services, received: Received, once: Once) -> Response:
@@ -43,6 +44,7 @@ def keep(services: Services, received: Received, once: Once) -> Response:
 
     try:
         services.store.put_file(key, received.path)
+        reached("capture.put")
         done = do_once(services, once, 201, make)
     except DBAPIError:
         raise
@@ -56,6 +58,6 @@ def keep(services: Services, received: Received, once: Once) -> Response:
 
 def delete(services: Services, capture_id: str) -> None:
     """Delete a capture, its bytes too. Raises ConflictError while a job runs on it."""
-    with services.database.session_scope() as session:
+    with services.database.session_scope(step="delete") as session:
         records.delete_capture(session, capture_id)
     services.drainer.drain(DELETE_WAIT_S)

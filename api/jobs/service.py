@@ -130,7 +130,7 @@ def retry(
 
 def cancel(services: Services, job_id: str, caller: str) -> None:
     """Ask a job to stop. Raises ConflictedError where it ended otherwise already."""
-    with services.database.session_scope(actor_of(caller)) as session:
+    with services.database.session_scope(actor_of(caller), step="cancel") as session:
         job = jobs.request_cancel(session, job_id)
         _check_cancelled(job)
 
@@ -146,6 +146,6 @@ def _check_cancelled(job: Job) -> None:
 
 def delete(services: Services, job_id: str) -> None:
     """Delete a job and its bytes. Raises ConflictError while it runs."""
-    with services.database.session_scope() as session:
+    with services.database.session_scope(step="delete") as session:
         jobs.delete_job(session, job_id)
     services.drainer.drain(DELETE_WAIT_S)

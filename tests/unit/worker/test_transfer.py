@@ -70,7 +70,7 @@ def test_the_manifest_is_uploaded_last(store: LocalObjectStore, tmp_path: Path) 
             super().put_file(key, path, on_bytes)
 
     watching = Watching(store.root, public_url="", signing_key=b"")
-    upload_folder(watching, folder, "p/", no_guard, workers=4)
+    upload_folder(watching, folder, "p/", no_guard, workers=4, step="publish")
     assert order == ["p/deep/file.txt", "p/manifest.json"]
 
 
@@ -78,7 +78,7 @@ def test_inputs_come_once_and_again_only_where_they_differ(
     store: LocalObjectStore, tmp_path: Path
 ) -> None:
     folder, manifest = stage_folder(tmp_path)
-    upload_folder(store, folder, "p/", no_guard, workers=2)
+    upload_folder(store, folder, "p/", no_guard, workers=2, step="publish")
     workspace = Workspace(tmp_path / "job")
     workspace.root.mkdir()
     reads, work = ("train", "skipped"), work_with(manifest)
@@ -94,7 +94,7 @@ def test_inputs_come_once_and_again_only_where_they_differ(
 
 def test_what_lies_here_needs_no_room(store: LocalObjectStore, tmp_path: Path) -> None:
     folder, manifest = stage_folder(tmp_path / "made", "result")
-    upload_folder(store, folder, "p/", no_guard, workers=1)
+    upload_folder(store, folder, "p/", no_guard, workers=1, step="publish")
     workspace = Workspace(tmp_path / "job")
     work = replace(work_with(manifest), capture_bytes=5)
 
@@ -113,7 +113,7 @@ def test_what_lies_here_needs_no_room(store: LocalObjectStore, tmp_path: Path) -
 
 def test_a_damaged_input_is_not_accepted(store: LocalObjectStore, tmp_path: Path) -> None:
     folder, manifest = stage_folder(tmp_path)
-    upload_folder(store, folder, "p/", no_guard, workers=2)
+    upload_folder(store, folder, "p/", no_guard, workers=2, step="publish")
     store.path_of("p/deep/file.txt").write_text("rotten")
     workspace = Workspace(tmp_path / "job")
     workspace.root.mkdir()
@@ -133,9 +133,9 @@ def test_a_guard_ends_a_transfer_and_leaves_nothing(
 
     folder, _ = stage_folder(tmp_path)
     with pytest.raises(StopError):
-        upload_folder(store, folder, "p/", stop, workers=2)
+        upload_folder(store, folder, "p/", stop, workers=2, step="publish")
     assert list(store.list("p/")) == []
-    upload_folder(store, folder, "p/", no_guard, workers=2)
+    upload_folder(store, folder, "p/", no_guard, workers=2, step="publish")
     with pytest.raises(StopError):
         download_folder(store, "p/", tmp_path / "new", stop, workers=2)
     assert not [path for path in tmp_path.iterdir() if "new" in path.name]

@@ -1,27 +1,23 @@
 """COMMITs whose outcome nobody knows: what was uploaded stays unless the database refused it.
 
-A real runner with a real stage process; the database answers, or does not, as a test says.
+A real runner with a real stage process; the database's answer is lost where a test says so.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import pytest
-from sqlalchemy.exc import OperationalError
-from sqlalchemy.orm import Session
 
 from deploy.embedded import free_port
 from storage import keys
 from storage.claims import Claim, claim_stage
-from storage.db import Database
 from storage.jobs import stage_id
 from storage.leases import reap_expired
+from tests.faults import at_step, lose_answer
 from tests.integration.engine import Engine
 from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.runner import Runner
@@ -30,49 +26,12 @@ from worker.settings import WorkerSettings
 TOYS = "tests.integration.toy_stages"
 
 
-class Doubtful(Database):
-    """A database whose answer to some COMMITs is lost on the way.
-
-    lose: the next so many COMMITs end in an error; applied: whether they happened all the same.
-    only: the operation whose transactions are concerned; None for all. on_loss: called each time.
-    """
-
-    def __init__(self, url: str) -> None:
-        super().__init__(url)
-        self.lose = 0
-        self.applied = True
-        self.on_loss = lambda: None
-        self.only: str | None = None
-
-    @contextmanager
-    def session_scope(self, actor: str | None = None) -> Iterator[Session]:
-        with self._write() as session, session.begin() as transaction:
-            if actor is not None:
-                session.info["actor"] = actor
-            yield session
-            if self.lose and (self.only is None or self.only in session.info.get("said", [])):
-                self.lose -= 1
-                if self.applied:
-                    transaction.commit()
-                else:
-                    transaction.rollback()
-                self.on_loss()
-                raise OperationalError("COMMIT", {}, Exception("the connection is gone"))
-
-
 @pytest.fixture(scope="module")
 def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
     folder = tmp_path_factory.mktemp("doubt")
     made = Engine(folder, f"redis://127.0.0.1:{free_port()}/0")
     yield made
     made.close()
-
-
-@pytest.fixture
-def doubtful(engine: Engine) -> Iterator[Doubtful]:
-    made = Doubtful(engine.settings.resolved_database_url)
-    yield made
-    made.dispose()
 
 
 @pytest.fixture(scope="module")
@@ -98,42 +57,30 @@ def claimed(engine: Engine, job: str, lease_s: float = 60.0) -> Claim:
     return claim
 
 
-def mark(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Have the runner's closing operation say so in the session that it runs in."""
-    import worker.runner
-
-    real = getattr(worker.runner, name)
-
-    def said(session: Session, *args: Any, **kwargs: Any) -> Any:
-        session.info.setdefault("said", []).append(name)
-        return real(session, *args, **kwargs)
-
-    monkeypatch.setattr(worker.runner, name, said)
-
-
 @pytest.mark.parametrize("ends_after", [True, False], ids=["worker ends", "answers later"])
 @pytest.mark.parametrize("applied", [True, False], ids=["applied", "not applied"])
 @pytest.mark.parametrize("what", ["succeed_stage", "fail_stage"])
 def test_what_a_row_names_is_there_whatever_became_of_the_commit(
     engine: Engine,
     slot: Runner,
-    doubtful: Doubtful,
     monkeypatch: pytest.MonkeyPatch,
     what: str,
     applied: bool,
     ends_after: bool,
 ) -> None:
-    mark(monkeypatch, what)
     shutdown = threading.Event()
-    doubtful.only, doubtful.applied = what, applied
-    doubtful.lose = 1
-    doubtful.on_loss = shutdown.set if ends_after else lambda: None
-    monkeypatch.setattr(slot, "_database", doubtful)
     monkeypatch.setattr(slot, "_shutdown", shutdown)
     monkeypatch.setattr("worker.runner.RECORD_STEP_S", 0.01)
     job = engine.submit({"ingest": {"fail": what == "fail_stage"}}, ring=False)
     claim = claimed(engine, job)
-    ready = slot.run(claim)
+
+    def lose() -> None:
+        if ends_after:
+            shutdown.set()
+        lose_answer()
+
+    with at_step("finish.committed" if applied else "finish.commit", lose):
+        ready = slot.run(claim)
     row = engine.stage(job, "ingest")
     uploaded = list(engine.store.list(keys.attempt_prefix(job, "ingest", 1, 1)))
     assert uploaded, "what the row may name must not be deleted"
@@ -185,7 +132,7 @@ def test_a_worker_that_slept_deletes_nothing_of_a_later_claim(
 
 @pytest.mark.parametrize("applied", [True, False])
 def test_the_checkpoint_that_a_row_names_outlives_a_commit_in_doubt(
-    engine: Engine, doubtful: Doubtful, tmp_path: Path, applied: bool
+    engine: Engine, tmp_path: Path, applied: bool
 ) -> None:
     job = engine.submit({}, ring=False)
     claim = claimed(engine, job)
@@ -199,10 +146,13 @@ def test_the_checkpoint_that_a_row_names_outlives_a_commit_in_doubt(
         uploader.close(finish=True, timeout_s=10)
 
     for number in (1, 2, 3):
-        uploader = CheckpointUploader(doubtful, engine.store, claim, lambda: None, workers=1)
+        uploader = CheckpointUploader(engine.database, engine.store, claim, lambda: None, workers=1)
         uploader._number = number  # as if it were one uploader over time
-        doubtful.lose, doubtful.applied, doubtful.only = int(number == 2), applied, None
-        save(number)
+        if number == 2:
+            with at_step("checkpoint.committed" if applied else "checkpoint.commit"):
+                save(number)
+        else:
+            save(number)
         prefix = engine.stage(job, "ingest").checkpoint_prefix
         assert prefix is not None
         named = b"".join(engine.store.read(f"{prefix}state"))
