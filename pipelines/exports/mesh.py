@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,21 @@ def empty_mesh() -> TriangleMesh:
     """A mesh without vertices."""
     none = np.zeros((0, 3))
     return TriangleMesh(none, np.zeros((0, 3), np.int32), none, none)
+
+
+def joined(pieces: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Meshes as one."""
+    if not pieces:
+        return empty_mesh()
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    return TriangleMesh(
+        vertices=np.concatenate([piece.vertices for piece in pieces]),
+        faces=np.concatenate(
+            [piece.faces + start for piece, start in zip(pieces, starts, strict=False)]
+        ).astype(np.int32),
+        colors=np.concatenate([piece.colors for piece in pieces]),
+        normals=np.concatenate([piece.normals for piece in pieces]),
+    )
 
 
 def unit_normals(normals: Floats) -> Floats:

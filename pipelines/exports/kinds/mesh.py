@@ -74,6 +74,14 @@ class MeshOptions(CropOptions, TextureOptions):
         description="Triangles of the whole mesh as it is delivered, 100000 for phones and the "
         "web; 0 for all that max_faces leaves. Open borders stay.",
     )
+    lods: int = Field(
+        0,
+        ge=0,
+        le=3,
+        description="Levels of detail beside mesh.glb: mesh-lod1.glb has a quarter of its "
+        "triangles, mesh-lod2.glb a sixteenth, mesh-lod3.glb a sixty-fourth, each with a texture "
+        "of half the side.",
+    )
 
     @field_validator("formats")
     @classmethod
@@ -91,7 +99,8 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     """
     # Imported where it runs: the API reads this file too.
     from pipelines.exports.crop import crop_of, cropped, empty_crop, narrowed, surface_in
-    from pipelines.exports.mesh import TexturedMesh
+    from pipelines.exports.formats import glb
+    from pipelines.exports.levels import levels_of, texture_px_of
     from pipelines.exports.reduction import reduced
     from pipelines.exports.surface.shells import Shell, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
@@ -134,27 +143,48 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         ctx.progress(_FUSE_SHARE, f"reducing {len(mesh.faces)} triangles")
         mesh = reduced(mesh, options.triangles)
     shown = scene.training_images()
-    skin = painted(
-        mesh,
-        shown,
-        [scene.lens_of(image) for image in shown],
-        options,
-        ctx,
-        (_FUSE_SHARE, _TEXTURE_SHARE),
-    )
+    each = (_TEXTURE_SHARE - _FUSE_SHARE) / (1 + options.lods)
+
+    def paint(shape: TriangleMesh, level: int) -> TriangleMesh | TexturedMesh:
+        side = texture_px_of(level, options.texture_px)
+        return painted(
+            shape,
+            shown,
+            [scene.lens_of(image) for image in shown],
+            options.model_copy(update={"texture_px": side}),
+            ctx,
+            (_FUSE_SHARE + each * level, _FUSE_SHARE + each * (level + 1)),
+        )
+
+    skin = paint(mesh, 0)
+    levels = []
+    for level, shape in enumerate(levels_of(mesh, options.lods), start=1):
+        coarse, path = paint(shape, level), ctx.out / f"mesh-lod{level}.glb"
+        glb.write_mesh(path, coarse, scene.cameras.metric)
+        levels.append({"file": path.name, **_told(coarse)})
     ctx.progress(_TEXTURE_SHARE, "writing")
     _write(mesh, skin, options, ctx, scene.cameras.metric)
     return {
         "formats": list(options.formats),
-        "texture_px": len(skin.texture) if isinstance(skin, TexturedMesh) else None,
         "num_vertices": len(mesh.vertices),
-        "num_faces": len(mesh.faces),
+        **_told(skin),
+        "levels": levels,
         "num_views": len(images),
         "voxel": round(shells[0].voxel, 9),
         "bounds": shells[0].bounds.as_dict(),
         "shells": [
             {"voxel": round(shell.voxel, 9), **shell.bounds.as_dict()} for shell in shells[1:]
         ],
+    }
+
+
+def _told(skin: TriangleMesh | TexturedMesh) -> dict[str, Any]:
+    """What the report says of a delivered mesh."""
+    from pipelines.exports.mesh import TexturedMesh
+
+    return {
+        "texture_px": len(skin.texture) if isinstance(skin, TexturedMesh) else None,
+        "num_faces": len(skin.faces),
     }
 
 
@@ -192,7 +222,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=5,
+    version=6,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,
@@ -215,6 +245,16 @@ EXPORT = Export(
             "model/vnd.usdz+zip",
             "iPhone, iPad, Mac, Blender",
             on_request=True,
+        ),
+        *(
+            Artifact(
+                f"mesh-lod{level}.glb",
+                f"mesh-lod{level}.glb",
+                "model/gltf-binary",
+                "any glTF viewer, Blender",
+                on_request=True,
+            )
+            for level in (1, 2, 3)
         ),
     ),
 )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.exports.mesh import TriangleMesh, empty_mesh
+from pipelines.exports.reduction import reduced
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.scene.bounds import SceneBounds
 
@@ -17,9 +18,9 @@ _MIN_COMPONENT_SHARE = 0.02
 def clean(mesh: TriangleMesh, bounds: SceneBounds, max_faces: int) -> TriangleMesh:
     """Drop what lies outside the bounds and small loose pieces, and simplify.
 
-    Simplification is quadric decimation to at most `max_faces`. It tears thin bridges between
-    pieces, so loose ones are dropped before, where they would take their share of the faces, and
-    after. May return a mesh without vertices.
+    Simplification (`pipelines.exports.reduction`) is to about `max_faces`. It tears thin bridges
+    between pieces, so loose ones are dropped before, where they would take their share of the
+    faces, and after. May return a mesh without vertices.
     """
     inside = bounds.contains(mesh.vertices)
     faces = mesh.faces[inside[mesh.faces].all(axis=1)]
@@ -29,7 +30,7 @@ def clean(mesh: TriangleMesh, bounds: SceneBounds, max_faces: int) -> TriangleMe
     legacy = to_open3d(replace(mesh, faces=faces), origin)
     _drop_small_pieces(legacy)
     if len(legacy.triangles) > max_faces:
-        legacy = legacy.simplify_quadric_decimation(max_faces)
+        legacy = to_open3d(reduced(from_open3d(legacy, origin), max_faces), origin)
     legacy.remove_degenerate_triangles()
     _drop_small_pieces(legacy)
     return from_open3d(legacy, origin)

@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from pipelines.exports.mesh import TriangleMesh, empty_mesh
+from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.surface.clean import clean
 from pipelines.exports.surface.tsdf import fuse
 from pipelines.scene.bounds import SceneBounds
@@ -92,18 +90,3 @@ def _outside(mesh: TriangleMesh, inner: SceneBounds, overlap: float) -> Triangle
         return mesh
     hidden = smaller.contains(mesh.vertices)[mesh.faces].all(axis=1)
     return replace(mesh, faces=mesh.faces[~hidden])
-
-
-def joined(pieces: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Meshes as one."""
-    if not pieces:
-        return empty_mesh()
-    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-    return TriangleMesh(
-        vertices=np.concatenate([piece.vertices for piece in pieces]),
-        faces=np.concatenate(
-            [piece.faces + start for piece, start in zip(pieces, starts, strict=False)]
-        ).astype(np.int32),
-        colors=np.concatenate([piece.colors for piece in pieces]),
-        normals=np.concatenate([piece.normals for piece in pieces]),
-    )

@@ -9,9 +9,8 @@ import open3d
 import pytest
 from scipy.spatial import cKDTree
 
-from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.reduction import reduced
-from pipelines.exports.surface.shells import joined
 
 _geometry: Any = open3d.geometry
 _utility: Any = open3d.utility

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import open3d
 import pytest
+from scipy.spatial import cKDTree
 
 from pipelines.errors import Cancelled, ExportError
 from pipelines.exports.formats.glb import read_mesh
@@ -14,6 +15,7 @@ from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh
 from pipelines.exports.texture import charts
 from pipelines.manifest import RunHooks
+from pipelines.registry import get_stage
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -102,3 +104,21 @@ def test_a_cancel_ends_the_stage(job: Workspace) -> None:
     with pytest.raises(Cancelled):
         tiny_job.run_with(job, "mesh", RunHooks(is_cancelled=lambda: True))
     assert not job.stage("mesh").exists()
+
+
+def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -> None:
+    summary = tiny_job.run(job, "mesh", lods=2)["summary"]
+    full = read_mesh(job.stage("mesh") / "mesh.glb")
+    size, triangles = np.ptp(full.vertices, axis=0).max(), len(full.faces)
+    assert [level["file"] for level in summary["levels"]] == ["mesh-lod1.glb", "mesh-lod2.glb"]
+    for level in summary["levels"]:
+        coarse = read_mesh(job.stage("mesh") / level["file"])
+        assert isinstance(coarse, TexturedMesh)
+        assert len(coarse.faces) == level["num_faces"] == pytest.approx(triangles / 4, rel=0.1)
+        assert len(coarse.texture) == level["texture_px"]
+        off, _ = cKDTree(full.vertices).query(coarse.vertices)
+        assert np.percentile(off, 95) < 0.02 * size
+        triangles = len(coarse.faces)
+    artifacts = {artifact.name for artifact in get_stage("mesh").artifacts}
+    assert {path.name for path in job.stage("mesh").glob("*.glb")} <= artifacts
+    assert not (job.stage("mesh") / "mesh-lod3.glb").exists()

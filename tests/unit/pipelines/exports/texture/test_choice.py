@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.exports.surface.shells import joined
+from pipelines.exports.mesh import joined
 from pipelines.exports.texture import photos as photos_module
 from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos, neighbours_of
 from tests.unit.pipelines.exports.texture import painted_ball
