@@ -22,6 +22,7 @@ from api.captures import endpoints as captures
 from api.captures.receiving import sweep
 from api.deps import MAX_STORE_CALLS, Services, require_key
 from api.documentation import page_of
+from api.exports import endpoints as exports
 from api.jobs import endpoints as jobs
 from api.probes import Probe
 from api.problems import Problem
@@ -132,7 +133,7 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
             page_of(app.openapi()), headers={"Content-Security-Policy": PAGE_POLICY}
         )
 
-    keyed = (captures.router, jobs.router, artifacts.router, catalogue.router)
+    keyed = (*(captures.router, jobs.router, exports.router, artifacts.router, catalogue.router),)
     others = (artifacts.signed_router, health.router, catalogue.page_router)
     errors.install(
         app,

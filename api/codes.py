@@ -28,7 +28,7 @@ BYTES = ("object_not_found", "range_unsatisfiable", "object_store_unavailable")
 
 RETRY = (
     *("job_not_found", "capture_deleted", "conflict", "nothing_to_retry", "stage_skipped"),
-    "options_invalid",
+    *("options_invalid", "not_trained"),
 )
 """Of a call that runs a job again."""
 
@@ -48,6 +48,7 @@ CODES: dict[str, int] = {
     "conflict": 409,
     "job_finished": 409,
     "nothing_to_retry": 409,
+    "not_trained": 409,
     "idempotency_key_running": 409,
     "archive_bomb": 413,
     "too_large": 413,

@@ -114,10 +114,6 @@ def create_job(
     )
     if capture is None or capture.deleted_at is not None:
         raise NotFoundError("capture", capture_id)
-    names = [stage.name for stage in stages]
-    for position, stage in enumerate(stages):
-        if not set(stage.after) <= set(names[:position]):
-            raise ValueError(f"stage {stage.name} waits for a stage that is not before it")
     job = Job(
         id=new_id(),
         capture_id=capture_id,
@@ -130,6 +126,17 @@ def create_job(
         generation=1,
         created_at=when,
     )
+    return enter(session, job, stages, max_attempts, when)
+
+
+def enter(
+    session: Session, job: Job, stages: Sequence[StageSeed], max_attempts: int, when: datetime
+) -> Job:
+    """Write a new job and its stages. Raises ValueError for stages that nothing could start."""
+    names = [stage.name for stage in stages]
+    for position, stage in enumerate(stages):
+        if not set(stage.after) <= set(names[:position]):
+            raise ValueError(f"stage {stage.name} waits for a stage that is not before it")
     session.add(job)
     session.flush()
     rows = _stage_rows(job, stages, max_attempts)
@@ -164,15 +171,20 @@ def request_cancel(session: Session, job_id: str, when: datetime | None = None) 
 def open_for_retry(session: Session, job_id: str) -> Job:
     """A job that is over, locked, with its stages, their manifests and its capture's row.
 
-    Raises NotFoundError; ConflictError while it runs, or a stage of it has not stopped.
+    Of an export its job is locked too, and loaded likewise. Raises NotFoundError; ConflictError
+    while it runs, or a stage of it has not stopped.
     """
+    parent_id = session.scalar(select(Job.parent_id).where(Job.id == job_id))
+    if parent_id is not None:
+        lock_job(session, parent_id)  # before its exports: so does who deletes it
     job, stages = lock_job(session, job_id)
     if job.state not in JOB_TERMINAL or any(row.state == "running" for row in stages):
         raise ConflictError(f"Job {job_id} is not over yet.")
     session.get(Capture, job.capture_id, with_for_update={"read": True}, populate_existing=True)
     query = select(Job).where(Job.id == job_id)
     loaded = selectinload(Job.stages).undefer(StageRow.manifest)
-    return session.scalars(query.options(joinedload(Job.capture), loaded)).one()
+    parents = joinedload(Job.parent).selectinload(Job.stages).undefer(StageRow.manifest)
+    return session.scalars(query.options(joinedload(Job.capture), loaded, parents)).one()
 
 
 def _with_other_inputs(stages: Sequence[StageRow], redo: Collection[str]) -> set[str]:
@@ -240,15 +252,25 @@ def retry_job(
 def delete_job(session: Session, job_id: str, when: datetime | None = None) -> None:
     """Delete a job's records and put its bytes up for deletion (`storage.deletions`).
 
-    A queued job is dropped. Raises ConflictError while it runs or a stage of it has not stopped.
+    Its exports go with it; a queued job or export is dropped. Raises ConflictError while it or an
+    export of it runs, or has not stopped.
     """
-    job, stages = lock_job(session, job_id)
+    when = when or now(session)
+    _check_stopped(*lock_job(session, job_id))
+    exports = session.scalars(select(Job.id).where(Job.parent_id == job_id).order_by(Job.id)).all()
+    for export_id in exports:
+        _check_stopped(*lock_job(session, export_id))
+    for one in (*exports, job_id):
+        # Stages first: that waits for who just adds log lines, and holds off who would.
+        for record in (StageRow, Event, LogLine, StageRun):
+            session.execute(delete(record).where(record.job_id == one))
+        session.add(PendingDeletion(prefix=job_prefix(one), created_at=when))
+        session.execute(delete(Job).where(Job.id == one))
+
+
+def _check_stopped(job: Job, stages: Sequence[StageRow]) -> None:
+    what = f"Job {job.id}" if job.parent_id is None else f"The job's export {job.id}"
     if job.state == "running":
-        raise ConflictError(f"Job {job_id} is running; cancel it first.")
+        raise ConflictError(f"{what} is running; cancel it first.")
     if job.state == "cancelling" or any(row.state == "running" for row in stages):
-        raise ConflictError(f"Job {job_id} is {job.state}; wait until it has stopped.")
-    # Stages first: that waits for who just adds log lines, and holds off who would.
-    for record in (StageRow, Event, LogLine, StageRun):
-        session.execute(delete(record).where(record.job_id == job_id))
-    session.add(PendingDeletion(prefix=job_prefix(job_id), created_at=when or now(session)))
-    session.execute(delete(Job).where(Job.id == job_id))
+        raise ConflictError(f"{what} is {job.state}; wait until it has stopped.")

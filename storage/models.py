@@ -73,12 +73,16 @@ class Capture(Base):
 
 
 class Job(Base):
-    """The stages on one capture. generation: 1, and one more with every retry."""
+    """The stages on one capture, or an export of another job's results (`storage.exports`).
+
+    parent_id: the job that an export is of. generation: 1, and one more with every retry.
+    """
 
     __tablename__ = "jobs"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
     capture_id: Mapped[str] = mapped_column(ForeignKey("captures.id"), index=True)
+    parent_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
     state: Mapped[str] = mapped_column(String(16))
     preset: Mapped[str] = mapped_column(String(32))
     preset_reason: Mapped[str] = mapped_column(CleanText(300), default="")
@@ -93,9 +97,14 @@ class Job(Base):
     cancel_requested_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
     capture: Mapped[Capture] = relationship(lazy="raise")
+    parent: Mapped[Job | None] = relationship(remote_side=id, lazy="raise")
     stages: Mapped[list[StageRow]] = relationship(order_by="StageRow.seq", lazy="select")
 
-    __table_args__ = (Index(None, "created_at", "id"), Index(None, "state", "created_at", "id"))
+    __table_args__ = (
+        Index(None, "created_at", "id"),
+        Index(None, "state", "created_at", "id"),
+        Index(None, "parent_id", "created_at", "id"),
+    )
 
 
 class StageRow(Base):

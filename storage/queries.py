@@ -36,7 +36,10 @@ class StageInput:
 
 @dataclass(frozen=True)
 class StageWork:
-    """All that running a claimed stage takes. inputs: the published stages, by name."""
+    """All that running a claimed stage takes.
+
+    inputs: the published stages, by name; of an export those of the job that it is of.
+    """
 
     capture_key: str
     capture_bytes: int
@@ -46,6 +49,7 @@ class StageWork:
     options: dict[str, Any]
     inputs: dict[str, StageInput]
     checkpoint_prefix: str | None
+    is_export: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,12 +106,14 @@ def list_jobs(
     label: str | None = None,
     limit: int = 50,
     cursor: str | None = None,
+    exports_of: str | None = None,
 ) -> tuple[list[Job], str | None]:
     """A page of jobs with their stages, newest first, and the next page's cursor (None: the last).
 
-    label: "key" (has it) or "key=value". Raises InvalidCursorError; ValueError for no such state.
+    label: "key" (has it) or "key=value". exports_of: a job, whose exports are listed; else none
+    are. Raises InvalidCursorError; ValueError for no such state.
     """
-    query = select(Job).options(selectinload(Job.stages))
+    query = select(Job).options(selectinload(Job.stages)).where(Job.parent_id == exports_of)
     if state is not None:
         if state not in JOB_STATES:
             raise ValueError(f"no job state is called {state}; there are {', '.join(JOB_STATES)}")
@@ -160,12 +166,15 @@ def stage_work(session: Session, claim: Claim) -> StageWork:
     """What a claimed stage needs. Raises NotFoundError where its job was deleted."""
     query = select(Job).where(Job.id == claim.job_id)
     query = query.options(
-        joinedload(Job.capture), selectinload(Job.stages).undefer(StageRow.manifest)
+        joinedload(Job.capture),
+        selectinload(Job.stages).undefer(StageRow.manifest),
+        joinedload(Job.parent).selectinload(Job.stages).undefer(StageRow.manifest),
     )
     job = session.scalar(query)
     if job is None:
         raise NotFoundError("job", claim.job_id)
     own = next(row for row in job.stages if row.id == claim.stage_id)
+    made = job.stages if job.parent is None else job.parent.stages
     return StageWork(
         capture_key=job.capture.object_key,
         capture_bytes=job.capture.bytes,
@@ -175,10 +184,11 @@ def stage_work(session: Session, claim: Claim) -> StageWork:
         options=job.options.get(claim.name, {}),
         inputs={
             row.name: StageInput(row.name, row.output_prefix, row.manifest)
-            for row in job.stages
+            for row in made
             if row.state == "succeeded" and row.output_prefix and row.manifest
         },
         checkpoint_prefix=own.checkpoint_prefix,
+        is_export=job.parent is not None,
     )
 
 

@@ -70,13 +70,16 @@ def get_capture(session: Session, capture_id: str) -> Capture:
 def delete_capture(session: Session, capture_id: str, when: datetime | None = None) -> None:
     """Delete a capture and put its bytes up for deletion (`storage.deletions`).
 
-    Finished jobs keep their results. Raises ConflictError while a job on it is not over.
+    Finished jobs keep their results, and exports of them need no capture. Raises ConflictError
+    while a job on it is not over.
     """
     capture = session.get(Capture, capture_id, with_for_update=True, populate_existing=True)
     if capture is None or capture.deleted_at is not None:
         raise NotFoundError("capture", capture_id)
     live = select(func.count()).select_from(Job)
-    live = live.where(Job.capture_id == capture_id, Job.state.in_(JOB_LIVE))
+    live = live.where(
+        Job.capture_id == capture_id, Job.state.in_(JOB_LIVE), Job.parent_id.is_(None)
+    )
     if session.scalars(live).one():
         raise ConflictError(f"A job is running on capture {capture_id}; cancel it first.")
     when = when or now(session)

@@ -39,6 +39,8 @@ API_MAY_IMPORT = (
     "pipelines.errors",
     "pipelines.captures.sniff",
     "pipelines.captures.catalogue",
+    "pipelines.exports.catalogue",
+    "pipelines.exports.requests",
 )
 
 # What each room may take from the others, by prefix. api/client is a room of its own: the server

@@ -39,14 +39,17 @@ def publish_failure(
 ) -> FailureReport | None:
     """Write the report of a job that this claim's stage may end, and upload it.
 
-    error: `{code, message, hint, ...}`. prefix: of the attempt. None where it could not be stored.
+    error: `{code, message, hint, ...}`. prefix: of the attempt. None where it could not be stored,
+    and for an export: the report is about a job, and an export's error says all of it.
     """
     workspace = Workspace(work_dir / claim.job_id)
     folder = workspace.failed(claim.name) / "job"
     try:
         with database.read_scope() as session:
-            inputs = stage_work(session, claim).inputs
-        manifests = {name: found.manifest for name, found in inputs.items()}
+            work = stage_work(session, claim)
+        if work.is_export:
+            return None
+        manifests = {name: found.manifest for name, found in work.inputs.items()}
         write_failed_report(folder / REPORT, workspace, manifests, claim.name, error)
         upload_folder(store, folder, prefix, lambda: None, workers=1, step="report")
         return FailureReport(prefix, list_files(folder))

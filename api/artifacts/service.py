@@ -59,10 +59,14 @@ def find(job: Job, name: str) -> Published:
     for found in published(job):
         if found.artifact.name == name:
             return found
-    makers = {artifact.name: stage.name for stage in STAGES for artifact in stage.artifacts}
+    stages = STAGES
+    if job.parent_id is not None:
+        stages = tuple(stage for stage in STAGES if stage.name in {row.name for row in job.stages})
+    makers = {artifact.name: stage.name for stage in stages for artifact in stage.artifacts}
     on_request = {one.name for stage in STAGES for one in stage.artifacts if one.on_request}
     if name not in makers:
-        hint = f"A finished job has {', '.join(sorted(makers))}."
+        what = "job" if job.parent_id is None else "export of this kind"
+        hint = f"A finished {what} has {', '.join(sorted(makers))}."
     elif any(row.name == makers[name] and row.state == "skipped" for row in job.stages):
         hint = f"A job with preset {job.preset} on such a capture skips {makers[name]}."
     elif name in on_request:

@@ -6,6 +6,8 @@
     nerfworks status | watch | logs | download [JOB]     the newest job where none is named
     nerfworks events [JOB]            what happened to it: when, who, why
     nerfworks retry JOB               once more, from what failed or what --set changes
+    nerfworks export JOB KIND         a mesh, a video, ... of what a job has trained, whenever
+    nerfworks exports [JOB]           those that were asked for; --kinds: what there is
     nerfworks cancel | delete JOB
     nerfworks list | captures | presets
 
@@ -220,6 +222,41 @@ def retry(client: Client, args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
+def export(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Export what a job has trained: a mesh, a cloud, a video, ..."""
+    own = f"{args.kind}."  # as docs/options.md names them, and short
+    named = [text if text.startswith(own) else own + text for text in args.set]
+    options = _options(named).get(args.kind, {})
+    made = client.export(args.job, args.kind, options, _labels(args.label))
+    console.print(f"Export {made.id}: {args.kind} of job {args.job}", highlight=False)
+    ended = OK
+    if args.wait or args.download is not None:
+        folder = None if args.download is None else Path(args.download)
+        ended = _watch(client, made.id, folder, console)
+    else:
+        console.print(f"See it: nerfworks watch {made.id}", highlight=False)
+    if args.json:
+        _print_json(client.get_job(made.id))
+    return ended
+
+
+def exports(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """A table of a job's exports, newest first; --kinds: what can be exported"""
+    if args.kinds:
+        kinds = client.export_kinds()
+        if args.json:
+            _print_json([*kinds])
+        for kind in [] if args.json else kinds:
+            console.print(f"{kind.kind:<11} {clean(kind.summary)}", highlight=False)
+        return OK
+    found = [*client.exports(_job_of(client, args))]
+    if args.json:
+        _print_json([*found])
+    else:
+        print_jobs(found, console)
+    return OK
+
+
 def events(client: Client, args: argparse.Namespace, console: Console) -> int:
     """Print what happened to a job: when, what, who, why."""
     print_events(client.events(_job_of(client, args)), console)
@@ -316,6 +353,16 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
     one.add_argument("--wait", action="store_true", help="show the job until it is over")
     one.add_argument("--download", metavar="DIR", help="wait, then download the results there")
+    one = command("export", export, "named")
+    one.add_argument("kind", metavar="KIND", help="`nerfworks exports --kinds` lists them")
+    one.add_argument("--set", action="append", default=[], metavar="OPTION=VALUE")
+    one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
+    one.add_argument("--wait", action="store_true", help="show the export until it is over")
+    one.add_argument("--download", metavar="DIR", help="wait, then download the files there")
+    as_json.append(one)
+    one = command("exports", exports, "newest")
+    one.add_argument("--kinds", action="store_true", help="what can be exported")
+    as_json.append(one)
     command("events", events, "newest")
     command("delete", delete, "named")
     one = command("list", list_jobs)

@@ -27,6 +27,8 @@ from api.client.models import (
     ChecksumMismatch,
     ConnectionFailed,
     Event,
+    Export,
+    ExportKind,
     Job,
     JobError,
     JobFailed,
@@ -60,6 +62,8 @@ __all__ = [
     "Client",
     "ConnectionFailed",
     "Event",
+    "Export",
+    "ExportKind",
     "Job",
     "JobError",
     "JobFailed",
@@ -255,6 +259,31 @@ class Client:
         answer = self._wire.send(lambda: self._wire.http.post(path, json=wanted, headers=once))
         return Job.model_validate(checked(answer).json())
 
+    def export(
+        self,
+        job_id: str,
+        kind: str,
+        options: dict[str, Any] | None = None,
+        labels: dict[str, str] | None = None,
+        *,
+        idempotency_key: str | None = None,
+    ) -> Job:
+        """Export what a job has trained, whenever, once, however often the call had to be sent.
+
+        kind: one of `export_kinds`. options: {option: value}, laid over the job's own. What comes
+        back is a job of its own: wait for it, cancel, retry, download it as any other.
+        """
+        wanted = {"kind": kind, "options": options or {}, "labels": labels or {}}
+        path = f"/v1/jobs/{segment(job_id)}/exports"
+        once = once_header(idempotency_key)
+        answer = self._wire.send(lambda: self._wire.http.post(path, json=wanted, headers=once))
+        return Job.model_validate(checked(answer).json())
+
+    def exports(self, job_id: str) -> Iterator[Job]:
+        """The exports that were asked for of a job, newest first."""
+        path = f"/v1/jobs/{segment(job_id)}/exports"
+        return (Job.model_validate(item) for item in self._items(path, {}))
+
     def events(self, job_id: str, after: int = 0) -> Iterator[Event]:
         """What happened to a job, oldest first, page by page. after: a `seq` to go on from."""
         following: int | None = after
@@ -358,6 +387,11 @@ class Client:
         """JSON Schema of all options."""
         schema: dict[str, Any] = self._get("/v1/options")
         return schema
+
+    def export_kinds(self) -> list[ExportKind]:
+        """What can be exported, with JSON Schema of each kind's options."""
+        found = self._get("/v1/exports/kinds")
+        return [ExportKind.model_validate(item) for item in found["items"]]
 
     # The wire
 

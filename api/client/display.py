@@ -181,7 +181,11 @@ def print_events(events: Iterable[Event], console: Console) -> None:
 def print_job(job: Job, console: Console) -> None:
     """A job on a few lines."""
     console.print(f"Job {job.id}: {_state(job.state)}", highlight=False)
-    console.print(f"preset {job.preset} ({clean(job.preset_reason)})", highlight=False)
+    if job.export is not None:
+        told = f"{clean(job.export.kind)} of job {job.export.job_id}"
+        console.print(f"export: {told}", highlight=False)
+    else:
+        console.print(f"preset {job.preset} ({clean(job.preset_reason)})", highlight=False)
     for key, value in sorted(job.labels.items()):
         console.print(f"label {clean(key)}={clean(value)}", highlight=False)
     table = Table("stage", "state", "progress", "attempt", "time", "message", box=None)
@@ -242,7 +246,7 @@ def print_jobs(jobs: Iterable[Job], console: Console) -> None:
         table.add_row(
             job.id,
             _state(job.state),
-            job.preset,
+            job.preset if job.export is None else clean(job.export.kind),
             f"{job.created_at.astimezone():%Y-%m-%d %H:%M}",
             ", ".join(running),
             "" if psnr is None else f"{psnr:.1f} dB",
@@ -321,10 +325,22 @@ def _draft_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
+def result_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
+    """(what, value) of what an export says it made: its numbers and words, no lists."""
+    return [
+        (clean(name.replace("_", " ")), clean(str(value)))
+        for name, value in result.items()
+        if isinstance(value, str | int | float)
+    ]
+
+
 def print_results(
     job: Job, folder: Path, report: dict[str, Any], console: Console | None = None
 ) -> None:
-    """The tables of a finished job: each artifact in `folder`, then the quality."""
+    """The tables of a finished job: each artifact in `folder`, then the quality.
+
+    Of an export what it says it made takes the place of the quality.
+    """
     console = console or Console()
     artifacts = Table(title=f"Job {job.id}", box=None)
     artifacts.add_column("artifact", no_wrap=True)
@@ -339,8 +355,9 @@ def print_results(
             size((folder / artifact.name).stat().st_size),
             clean(artifact.opens_with),
         )
-    quality = Table("quality", "", box=None)
-    for what, value in quality_rows(report):
+    quality = Table("quality" if job.export is None else "result", "", box=None)
+    rows = quality_rows(report) if job.export is None else result_rows(job.export.result or {})
+    for what, value in rows:
         quality.add_row(what, value)
     console.print(artifacts)
     console.print(quality)

@@ -81,8 +81,30 @@ class Artifact(_Model):
     opens_with: str = ""
 
 
+class Export(_Model):
+    """What an export is of. job_id: of the job that was trained. result: what it says it made."""
+
+    kind: str
+    job_id: str
+    result: dict[str, Any] | None = None
+
+
+class ExportKind(_Model):
+    """A kind of export. options: JSON Schema. artifacts: what it may write, by name."""
+
+    kind: str
+    summary: str
+    version: int
+    on_request: bool
+    artifacts: list[dict[str, Any]]
+    options: dict[str, Any]
+
+
 class Job(_Model):
-    """A job. `artifacts` and `queue_position` are filled by `get_job`, not in lists."""
+    """A job, or an export of another one (`export`).
+
+    `artifacts` and `queue_position` are filled by `get_job`, not in lists.
+    """
 
     id: str
     state: str
@@ -92,6 +114,7 @@ class Job(_Model):
     options: dict[str, Any]
     labels: dict[str, str]
     capture_id: str
+    export: Export | None = None
     stages: list[Stage]
     metrics: dict[str, float | int | None] | None
     assets: dict[str, Any] | None = None

@@ -126,8 +126,18 @@ class StageView(BaseModel):
     finished_at: datetime | None
 
 
+class ExportView(BaseModel):
+    """What an export is of."""
+
+    kind: str
+    job_id: str = Field(description="The job whose trained scene it exports.")
+    result: dict[str, Any] | None = Field(
+        description="What it says of what it made, once it has: counts, sizes, bounds."
+    )
+
+
 class JobSummary(BaseModel):
-    """A job as it stands in a list."""
+    """A job, or an export, as it stands in a list."""
 
     id: str
     state: JobState
@@ -137,6 +147,9 @@ class JobSummary(BaseModel):
     options: dict[str, Any] = Field(description="The complete options of every stage.")
     labels: dict[str, str]
     capture_id: str
+    export: ExportView | None = Field(
+        description="Of a job that exports what another one trained; null for a job on a capture."
+    )
     stages: list[StageView]
     metrics: dict[str, float | int | None] | None = Field(
         description="Held-out quality, once measured: psnr in dB, ssim, num_images, width, height."
@@ -163,6 +176,7 @@ class JobSummary(BaseModel):
             "options": job.options,
             "labels": job.labels,
             "capture_id": job.capture_id,
+            "export": export_of(job),
             "stages": [StageView.model_validate(row) for row in job.stages],
             "metrics": metrics_of(job.stages),
             "assets": assets_of(job.stages),
@@ -223,6 +237,15 @@ class LogView(BaseModel):
     first: int = Field(description="The number of the first line here; the first of all is 0.")
     next: int = Field(description="Give it as `line` to go on from here.")
     total: int = Field(description="Lines there are so far.")
+
+
+def export_of(job: Job) -> ExportView | None:
+    """What a job exports, None where it is no export."""
+    if job.parent_id is None:
+        return None
+    (stage,) = job.stages
+    made = stage.summary if stage.state == "succeeded" else None
+    return ExportView(kind=stage.name, job_id=job.parent_id, result=made)
 
 
 def metrics_of(stages: list[StageRow]) -> dict[str, float | int | None] | None:

@@ -134,14 +134,18 @@ def run_stage(services: Services, job_id: str, name: str, files: dict[str, bytes
     summaries = {"evaluate": summary, "assess": assets}
     manifest = {"files": entries, "summary": summaries.get(name, {})}
     with services.database.session_scope() as session:
-        manifest |= made_from(get_job(session, job_id, manifests=True), name, entries)
+        job = get_job(session, job_id, manifests=True)
+        parent = None if job.parent_id is None else get_job(session, job.parent_id, manifests=True)
+        manifest |= made_from(job, parent, name, entries)
         succeed_stage(session, claim, manifest=manifest, output_prefix=prefix)
 
 
-def made_from(job: Job, name: str, entries: list[dict[str, Any]]) -> dict[str, Any]:
+def made_from(
+    job: Job, parent: Job | None, name: str, entries: list[dict[str, Any]]
+) -> dict[str, Any]:
     """What the manifest of a stage says of its inputs, as `pipelines.manifest` writes it."""
     stage = get_stage(name)
-    made = {row.name: row.manifest for row in job.stages if row.manifest}
+    made = {row.name: row.manifest for row in (parent or job).stages if row.manifest}
     inputs = {read: made[read] for read in stage.reads if read in made}
     if not stage.after:
         inputs["input"] = {"content": job.capture_id}

@@ -34,6 +34,9 @@ V1_CALLS = [
     ("GET", "/v1/jobs/x"),
     ("POST", "/v1/jobs/x/cancel"),
     ("POST", "/v1/jobs/x/retry"),
+    ("POST", "/v1/jobs/x/exports"),
+    ("GET", "/v1/jobs/x/exports"),
+    ("GET", "/v1/exports/kinds"),
     ("GET", "/v1/jobs/x/events"),
     ("DELETE", "/v1/jobs/x"),
     ("GET", "/v1/jobs/x/artifacts"),
@@ -263,6 +266,7 @@ def test_openapi_names_operations_and_the_shape_of_errors(service: Service) -> N
     ids = {call["operationId"] for calls in document["paths"].values() for call in calls.values()}
     assert ids == {
         *("create_capture", "list_captures", "get_capture", "delete_capture"),
+        *("create_export", "list_exports", "list_export_kinds"),
         *(
             "create_job",
             "validate_job",

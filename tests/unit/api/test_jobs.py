@@ -44,6 +44,7 @@ def test_new_job_is_queued_with_all_its_stages(service: Service) -> None:
             "options",
             "labels",
             "capture_id",
+            "export",
             "stages",
         ),
         *("queue_position", "metrics", "assets", "error", "artifacts"),

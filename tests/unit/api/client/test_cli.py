@@ -119,6 +119,53 @@ def test_submit_and_download_ends_with_files_and_tables(
     assert job.labels == {"a": "b"}
 
 
+def test_an_export_is_asked_for_waited_for_and_downloaded(
+    command: LiveServer, archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["submit", str(archive), "--preset", "preview"]) == 0
+    job = newest(command)
+    assert cli.main(["export", job, "mesh"]) == 1
+    assert "not ended yet" in capsys.readouterr().err
+    finish_job(command.services, job, lambda name: b"x")
+
+    def work() -> None:
+        with Client(command.url, KEY) as client:
+            deadline = time.monotonic() + 20
+            while not (found := list(client.exports(job))):
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+        run_stage(command.services, found[0].id, "mesh", {"mesh.usdz": b"for a phone"})
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    out = tmp_path / "out"
+    wanted = ["--set", "mesh.triangles=5", "--set", 'formats=["glb","usdz"]', "--label", "a=b"]
+    assert cli.main(["export", job, "mesh", *wanted, "--download", str(out)]) == 0
+    thread.join()
+    assert [path.name for path in out.iterdir()] == ["mesh.usdz"]
+    shown = capsys.readouterr().out
+    assert "iPhone" in shown
+    assert "PSNR" not in shown, "an export measures nothing"
+    with Client() as client:
+        (made,) = client.exports(job)
+        assert made.export is not None
+        assert (made.export.kind, made.export.job_id) == ("mesh", job)
+        assert made.options["mesh"]["triangles"] == 5
+        assert made.options["mesh"]["formats"] == ["glb", "usdz"]
+        assert made.labels == {"a": "b"}
+    assert cli.main(["exports", job]) == 0
+    assert made.id in capsys.readouterr().out
+    assert cli.main(["status", made.id]) == 0
+    assert f"mesh of job {job}" in capsys.readouterr().out
+    assert cli.main(["exports", "--kinds"]) == 0
+    assert "pointcloud" in capsys.readouterr().out
+    assert cli.main(["exports", "--kinds", "--json"]) == 0
+    kinds = json.loads(capsys.readouterr().out)
+    assert kinds[0]["options"]["properties"]
+    assert cli.main(["export", job, "mesh", "--set", "triangles=-1"]) == 1
+    assert "mesh.triangles" in capsys.readouterr().err
+
+
 def test_retry_says_what_runs_again_and_events_say_who_did_what(
     command: LiveServer, archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
