@@ -30,8 +30,8 @@ def fused() -> TriangleMesh:
     lens = Pinhole.of(TRUTH.cameras[0], LONG_SIDE)
     views = []
     for image in TRUTH.images:
-        z = depth_image(lens.intrinsics(), pose_matrix(image))
-        z = np.asarray(z * (1.0 + NOISE * noise.normal(size=z.shape)), np.float32)
+        exact = depth_image(lens.intrinsics(), pose_matrix(image))
+        z = np.asarray(exact * (1.0 + NOISE * noise.normal(size=exact.shape)), np.float32)
         grey = np.full((*z.shape, 3), 128, np.uint8)
         views.append(DepthView(lens, pose_matrix(image), grey, z))
     low, high = np.asarray(SUBJECT.low), np.asarray(SUBJECT.high)
