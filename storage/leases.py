@@ -22,7 +22,7 @@ from sqlalchemy.orm import Session
 
 from storage.claims import Claim
 from storage.db import name_actor, now
-from storage.errors import LostLeaseError, NotFoundError
+from storage.errors import ConflictError, LostLeaseError, NotFoundError
 from storage.models import Job, StageRow, StageRun
 from storage.runs import RunEnd, count_checkpoint, count_ends, run_of
 from storage.transitions import fail_for_good, lock_job, set_stage, settle
@@ -272,9 +272,14 @@ def release_stage(session: Session, claim: Claim, when: datetime | None = None) 
 
 
 def cancel_stage(session: Session, claim: Claim, when: datetime | None = None) -> str:
-    """The claimed stage was stopped because its job was cancelled, or failed elsewhere."""
+    """The claimed stage was stopped because its job was cancelled, or failed elsewhere.
+
+    Raises ConflictError where neither is so: a job without this stage would never end.
+    """
     job, stages, row, earlier = _held(session, claim, "cancelled")
     if earlier is None:
+        if job.state == "running":
+            raise ConflictError(f"Job {job.id} goes on: its stages are not to be cancelled.")
         when = when or now(session)
         reason = f"job_{job.state}"
         set_stage(session, row, "cancelled", when, run=RunEnd("cancelled"), reason=reason)

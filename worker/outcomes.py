@@ -91,6 +91,17 @@ def stalled_of(stage: str, silent_s: float) -> StageCrashedError:
     return StageCrashedError("stalled", error.as_dict())
 
 
+def gave_up_of(stage: str) -> StageFailedError:
+    """The stage stopped as one that was cancelled does, and nobody had asked it to."""
+    error = PipelineError(
+        f"The stage {stage} gave up, though nobody had cancelled it.",
+        code="internal_error",
+        hint="This is a fault of the service: see the job's logs for the last lines before it.",
+        retryable=True,
+    )
+    return StageFailedError(error.as_dict())
+
+
 def disk_too_small(stage: str, free: int, needed: int) -> StageFailedError:
     """There is no room for what the stage reads and writes."""
     error = ResourceError(

@@ -49,6 +49,7 @@ from worker.outcomes import (
     crash_of,
     disk_too_small,
     failure_of,
+    gave_up_of,
     stalled_of,
     time_limit_of,
 )
@@ -388,7 +389,7 @@ class Runner:
                     raise StageCrashedError("out_of_memory", message["error"])
                 raise StageFailedError(message["error"])
             elif kind == "cancelled":
-                raise StopRunError("cancel")
+                raise gave_up_of(stage.name)  # where we had asked, `_stop` took the message
             elif kind == "exit":
                 raise crash_of(stage.name, *process.exit_reason())
 

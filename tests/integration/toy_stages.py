@@ -1,7 +1,8 @@
 """Small stages that do real work in the real engine: files, checkpoints, time, errors, crashes.
 
 The capture is a JSON plan, `{stage: {...}}`, that says what each stage does; `witness` is a file to
-which every stage appends when it starts, resumes and ends. Point NERFWORKS_REGISTRY here.
+which every stage appends when it starts, resumes and ends; `until` is a file that a stage waits for
+before it ends. Point NERFWORKS_REGISTRY here.
 The stages bear the names of real ones, because options classes go by name.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -17,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pipelines.errors import CaptureError, ToolError, TrainingError
+from pipelines.errors import Cancelled, CaptureError, ToolError, TrainingError
 from pipelines.stage import Stage, StageContext
 
 _HERE = "tests.integration.toy_stages"
@@ -66,15 +68,24 @@ def run(options: Any, ctx: StageContext) -> dict[str, Any]:
             ctx.checkpoint_saved()
         ctx.progress(step / steps, f"step {step}", (steps - step) * plan.get("step_s", 0.0))
         if plan.get("save_every") and step % plan["save_every"] == 0:
-            draft = ctx.checkpoint / "step.json.new"
-            draft.write_text(json.dumps({"step": step}))
-            draft.replace(state)
-            ctx.checkpoint_saved()
+            _save(ctx, state, step)
+        while step == steps and plan.get("until") and not Path(plan["until"]).exists():
+            ctx.progress(1.0 - 0.1 * random.random(), "waiting")  # it gets on, so it does not hang
+            if plan.get("save_every"):
+                _save(ctx, state, step)
+            time.sleep(0.05)
     (ctx.out / "deep").mkdir()
     (ctx.out / "deep" / "result ä.txt").write_text(f"{ctx.stage} {steps}")
     read = [name for name in get_stage(ctx.stage).reads if ctx.workspace.is_complete(name)]
     _note(witness, f"{ctx.stage} end")
     return {"steps": steps, "first": first, "read": read}
+
+
+def _save(ctx: StageContext, state: Path, step: int) -> None:
+    draft = state.with_name("step.json.new")
+    draft.write_text(json.dumps({"step": step}))
+    draft.replace(state)
+    ctx.checkpoint_saved()
 
 
 def _misbehave(plan: dict[str, Any], ctx: StageContext, witness: Path) -> None:
@@ -87,6 +98,8 @@ def _misbehave(plan: dict[str, Any], ctx: StageContext, witness: Path) -> None:
         raise CaptureError("The plan says no.", code="no_images", hint="Change the plan.")
     if earlier < plan.get("fail_times", 0):
         raise ToolError("The tool broke.", retryable=True)
+    if earlier < plan.get("give_up_times", 0):
+        raise Cancelled("Nobody asked for it.")
     if earlier < plan.get("gpu_lost_times", 0):
         raise TrainingError("The GPU is gone.", code="gpu_lost", retryable=True)
     if earlier < plan.get("crash_times", 0):

@@ -424,6 +424,9 @@ def test_an_end_that_is_recorded_twice_says_the_same_and_changes_nothing(
     """A worker repeats it where the answer to its COMMIT was lost."""
     job = new_job(database)
     held = claim(database, job, "first")
+    if end == "cancel":
+        with database.session_scope() as session:
+            request_cancel(session, job)
     with database.session_scope() as session:
         first = ENDS[end](session, held)
     before = look(database, job)
@@ -432,6 +435,15 @@ def test_an_end_that_is_recorded_twice_says_the_same_and_changes_nothing(
         assert ENDS[end](session, held) == first
         assert len(list_events(session, job)) == events
     assert look(database, job) == before
+
+
+def test_a_stage_of_a_job_that_goes_on_is_not_cancelled(database: Database) -> None:
+    """Nothing would be left that could bring the job to its end."""
+    job = new_job(database)
+    held = claim(database, job, "first")
+    with pytest.raises(ConflictError), database.session_scope() as session:
+        cancel_stage(session, held)
+    assert look(database, job)["first"] == "running"
 
 
 def test_an_end_recorded_by_another_is_no_end_of_ours(database: Database) -> None:

@@ -246,6 +246,17 @@ def test_a_stage_that_hangs_is_ended_once_and_then_fails_the_job(
     assert (error or {}).get("code") == (None if times == 1 else "stalled")
 
 
+def test_a_stage_that_gives_up_unasked_is_tried_again(engine: Engine) -> None:
+    """Were it taken for cancelled, its job would never end."""
+    skip = ("frames", "train", "mesh", "video")
+    job = engine.submit({"ingest": {"give_up_times": 1}}, skip=skip, ring=False)
+    with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
+        engine.wait(lambda: engine.outcomes(job, "ingest") == ["error"])
+        row = engine.stage(job, "ingest")
+        assert (row.state, (row.error or {}).get("code")) == ("ready", "internal_error")
+        assert engine.wait_for(job, "succeeded", "failed").state == "succeeded"
+
+
 def test_silence_counts_only_while_somebody_watches() -> None:
     pulse = Pulse()
     begun = time.monotonic()
