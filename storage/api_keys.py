@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from storage.db import now
 from storage.errors import NotFoundError
-from storage.models import ApiKey
+from storage.models import DEFAULT_TENANT, ApiKey
 from storage.new_keys import new_api_key
 
 _USED_GRAIN = timedelta(minutes=1)  # last_used_at moves no oftener: a read should rarely write
@@ -20,17 +20,21 @@ def _digest(key: str) -> str:
     return hashlib.sha256(key.encode("utf-8", "replace")).hexdigest()
 
 
-def create_api_key(session: Session, name: str) -> tuple[ApiKey, str]:
+def create_api_key(
+    session: Session, name: str, tenant_id: str = DEFAULT_TENANT
+) -> tuple[ApiKey, str]:
     """Make a key. The second value is the key itself, which cannot be shown again."""
     key = new_api_key()
-    return ensure_api_key(session, key, name), key
+    return ensure_api_key(session, key, name, tenant_id), key
 
 
-def ensure_api_key(session: Session, key: str, name: str) -> ApiKey:
+def ensure_api_key(
+    session: Session, key: str, name: str, tenant_id: str = DEFAULT_TENANT
+) -> ApiKey:
     """The record of a key that was made elsewhere, made where there is none."""
     found = session.scalar(select(ApiKey).where(ApiKey.sha256 == _digest(key)))
     if found is None:
-        found = ApiKey(sha256=_digest(key), name=name, created_at=now(session))
+        found = ApiKey(tenant_id=tenant_id, sha256=_digest(key), name=name, created_at=now(session))
         session.add(found)
         session.flush()
     return found
@@ -40,6 +44,14 @@ def find_api_key(session: Session, key: str) -> ApiKey | None:
     """The record of a key that is valid, or None for one that is unknown or revoked."""
     query = select(ApiKey).where(ApiKey.sha256 == _digest(key), ApiKey.revoked_at.is_(None))
     return session.scalar(query)
+
+
+def tenant_of(session: Session, key_id: str) -> str:
+    """Whose a key is. Raises NotFoundError."""
+    record = session.get(ApiKey, key_id)
+    if record is None:
+        raise NotFoundError("API key", key_id)
+    return record.tenant_id
 
 
 def is_use_due(record: ApiKey, when: datetime) -> bool:

@@ -30,7 +30,10 @@ from storage.transitions import record_event, set_job
 
 @dataclass(frozen=True)
 class Claim:
-    """The right to run one attempt of a stage. `token` goes with every write."""
+    """The right to run one attempt of a stage. `token` goes with every write.
+
+    root: below which its job's bytes lie (`storage.keys`).
+    """
 
     stage_id: str
     job_id: str
@@ -39,6 +42,7 @@ class Claim:
     token: int
     attempt: int
     resource: str = RESOURCE_CPU
+    root: str = ""
 
 
 def is_due(when: datetime) -> ColumnElement[bool]:
@@ -140,17 +144,8 @@ def _claim(
         return None
     stage_id, job_id, name, token, attempt, resource = found
     job = session.get_one(Job, job_id, populate_existing=True, with_for_update={"key_share": True})
-    start_run(
-        session,
-        job_id=job_id,
-        stage=name,
-        token=token,
-        generation=job.generation,
-        attempt=attempt,
-        owner=owner,
-        when=when,
-    )
-    record_event(session, job_id, "stage.running", when, name, was="ready", attempt=attempt)
+    start_run(session, job, stage=name, token=token, attempt=attempt, owner=owner, when=when)
+    record_event(session, job, "stage.running", when, name, was="ready", attempt=attempt)
     if job.state == "queued":
         set_job(session, job, "running", when, started_at=when)
-    return Claim(stage_id, job_id, name, owner, token, attempt, resource)
+    return Claim(stage_id, job_id, name, owner, token, attempt, resource, job.object_root)

@@ -40,6 +40,10 @@ class LostLeaseError(StorageError):
     """A write carried a fencing token that is no longer the stage's: throw the work away."""
 
 
+class BlobMissingError(StorageError):
+    """Uploaded bytes that were here were deleted meanwhile: put them once more."""
+
+
 class ObjectMissingError(StorageError):
     """No object has this key."""
 

@@ -15,8 +15,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, selectinload
 
 from storage.db import now
-from storage.jobs import MAX_ATTEMPTS, StageSeed, enter
-from storage.models import Job, new_id
+from storage.jobs import MAX_ATTEMPTS, StageSeed, enter, identity
+from storage.models import Job
 from storage.states import JOB_LIVE
 from storage.transitions import lock_job
 
@@ -47,7 +47,7 @@ def create_export(
     """
     when = when or now(session)
     export = Job(
-        id=new_id(),
+        **identity(parent.tenant_id),
         capture_id=parent.capture_id,
         parent_id=parent.id,
         state="queued",

@@ -18,9 +18,20 @@ from sqlalchemy.orm import Session, joinedload, selectinload
 
 from storage.db import now
 from storage.errors import ConflictError, NotFoundError
-from storage.keys import job_prefix
-from storage.models import Capture, Event, Job, LogLine, PendingDeletion, StageRow, StageRun, new_id
+from storage.keys import job_root
+from storage.models import (
+    Capture,
+    Event,
+    Job,
+    JobGeneration,
+    LogLine,
+    PendingDeletion,
+    StageRow,
+    StageRun,
+    new_id,
+)
 from storage.queue import resource_of
+from storage.runs import start_generation
 from storage.states import JOB_TERMINAL
 from storage.transitions import (
     drop_waiting,
@@ -45,6 +56,7 @@ _UNTRIED: dict[str, Any] = {
     "output_prefix": None,
     "summary": None,
     "manifest": None,
+    "fingerprint": None,
 }
 
 
@@ -72,6 +84,7 @@ def _stage_rows(job: Job, stages: Sequence[StageSeed], max_attempts: int) -> lis
     return [
         StageRow(
             id=stage_id(job.id, stage.name),
+            tenant_id=job.tenant_id,
             job_id=job.id,
             name=stage.name,
             seq=position,
@@ -104,8 +117,8 @@ def create_job(
 ) -> Job:
     """Record a job and its stages; those with nothing to wait for are `ready`.
 
-    Ring for `ready_stage_ids(job)` after the commit. Raises NotFoundError for an unknown or
-    deleted capture, ValueError for stages that nothing could start.
+    It belongs to its capture's tenant. Ring for `ready_stage_ids(job)` after the commit. Raises
+    NotFoundError for an unknown or deleted capture, ValueError for stages that nothing could start.
     """
     when = when or now(session)
     # Looked at anew: the caller may have read it before another deleted it.
@@ -115,7 +128,7 @@ def create_job(
     if capture is None or capture.deleted_at is not None:
         raise NotFoundError("capture", capture_id)
     job = Job(
-        id=new_id(),
+        **identity(capture.tenant_id),
         capture_id=capture_id,
         state="queued",
         preset=preset,
@@ -127,6 +140,12 @@ def create_job(
         created_at=when,
     )
     return enter(session, job, stages, max_attempts, when)
+
+
+def identity(tenant_id: str) -> dict[str, str]:
+    """What a new job of a tenant is called, and where its bytes will lie."""
+    job_id = new_id()
+    return {"id": job_id, "tenant_id": tenant_id, "object_root": job_root(tenant_id, job_id)}
 
 
 def enter(
@@ -141,7 +160,8 @@ def enter(
     session.flush()
     rows = _stage_rows(job, stages, max_attempts)
     session.add_all(rows)
-    record_event(session, job.id, "job.queued", when)
+    start_generation(session, job, when)
+    record_event(session, job, "job.queued", when)
     session.flush()
     if not settle(session, job, rows, when):
         raise ValueError("a job needs at least one stage that can start")
@@ -246,6 +266,7 @@ def retry_job(
         finished_at=None,
         cancel_requested_at=None,
     )
+    start_generation(session, job, when, from_stage)
     return settle(session, job, stages, when)
 
 
@@ -256,21 +277,22 @@ def delete_job(session: Session, job_id: str, when: datetime | None = None) -> N
     export of it runs, or has not stopped.
     """
     when = when or now(session)
-    _check_stopped(*lock_job(session, job_id))
-    exports = session.scalars(select(Job.id).where(Job.parent_id == job_id).order_by(Job.id)).all()
-    for export_id in exports:
-        _check_stopped(*lock_job(session, export_id))
-    for one in (*exports, job_id):
+    exports = select(Job.id).where(Job.parent_id == job_id).order_by(Job.id)
+    gone = [_locked_and_stopped(session, job_id)]
+    gone += [_locked_and_stopped(session, one) for one in session.scalars(exports).all()]
+    for job in reversed(gone):
         # Stages first: that waits for who just adds log lines, and holds off who would.
-        for record in (StageRow, Event, LogLine, StageRun):
-            session.execute(delete(record).where(record.job_id == one))
-        session.add(PendingDeletion(prefix=job_prefix(one), created_at=when))
-        session.execute(delete(Job).where(Job.id == one))
+        for record in (StageRow, Event, LogLine, StageRun, JobGeneration):
+            session.execute(delete(record).where(record.job_id == job.id))
+        session.add(PendingDeletion(prefix=job.object_root, created_at=when))
+        session.execute(delete(Job).where(Job.id == job.id))
 
 
-def _check_stopped(job: Job, stages: Sequence[StageRow]) -> None:
+def _locked_and_stopped(session: Session, job_id: str) -> Job:
+    job, stages = lock_job(session, job_id)
     what = f"Job {job.id}" if job.parent_id is None else f"The job's export {job.id}"
     if job.state == "running":
         raise ConflictError(f"{what} is running; cancel it first.")
     if job.state == "cancelling" or any(row.state == "running" for row in stages):
         raise ConflictError(f"{what} is {job.state}; wait until it has stopped.")
+    return job

@@ -1,61 +1,94 @@
 """Every object key, and every prefix.
 
-    captures/CAPTURE/content                     the uploaded bytes
-    jobs/JOB/STAGE/ATTEMPT-TOKEN/...             what one attempt of a stage published
-    jobs/JOB/STAGE/checkpoint/TOKEN-NUMBER/...   the latest checkpoint of a running stage
+    tenants/TENANT/blobs/SHA256-NONCE/content                   uploaded bytes
+    tenants/TENANT/jobs/JOB/STAGE/ATTEMPT-TOKEN/...             what one attempt published
+    tenants/TENANT/jobs/JOB/STAGE/checkpoint/TOKEN-NUMBER/...   a running stage's latest checkpoint
 
-The token is the fencing token of the claim, so that two attempts never write to one place.
+The token is the fencing token of the claim, so that two attempts never write to one place. The
+nonce lets no place be used twice: bytes that come again while the old ones are still being deleted
+lie elsewhere.
+
+Before there were tenants, keys were `captures/CAPTURE/content` and `jobs/JOB/...`. What was
+recorded so stays where it lies: records hold whole keys and prefixes, and a job holds its root,
+`.../jobs/JOB/`, below which everything of it is written.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 
-def capture_prefix(capture_id: str) -> str:
-    """All bytes of a capture."""
-    return f"captures/{capture_id}/"
-
-
-def capture_content(capture_id: str) -> str:
-    """The uploaded bytes."""
-    return f"{capture_prefix(capture_id)}content"
+ROOTS = ("captures/", "jobs/", "tenants/")
+"""Below these lies all that is ours."""
 
 
-def job_prefix(job_id: str) -> str:
+@dataclass(frozen=True)
+class Place:
+    """Where an object lies. folder: the prefix that a record would name for it.
+
+    root, stage, token: of an object that a stage wrote: its job's root, and the claim's token.
+    """
+
+    folder: str
+    root: str | None = None
+    stage: str | None = None
+    token: int | None = None
+
+
+def blob_content(tenant_id: str, sha256: str, nonce: str) -> str:
+    """Uploaded bytes. nonce: chance."""
+    return f"tenants/{tenant_id}/blobs/{sha256}-{nonce}/content"
+
+
+def job_root(tenant_id: str, job_id: str) -> str:
     """All bytes of a job."""
-    return f"jobs/{job_id}/"
+    return f"tenants/{tenant_id}/jobs/{job_id}/"
 
 
-def stage_prefix(job_id: str, stage: str) -> str:
-    """All bytes of one stage of a job, of every attempt."""
-    return f"{job_prefix(job_id)}{stage}/"
+def stage_prefix(root: str, stage: str) -> str:
+    """All bytes of one stage of a job, of every attempt. root: of the job. Raises ValueError."""
+    if not root.endswith("/"):
+        raise ValueError(f"the root of a job ends in a slash: {root!r}")
+    return f"{root}{stage}/"
 
 
-def attempt_prefix(job_id: str, stage: str, attempt: int, token: int) -> str:
+def attempt_prefix(root: str, stage: str, attempt: int, token: int) -> str:
     """What one attempt publishes."""
-    return f"{stage_prefix(job_id, stage)}{attempt}-{token}/"
+    return f"{stage_prefix(root, stage)}{attempt}-{token}/"
 
 
-def checkpoint_prefix(job_id: str, stage: str, token: int, number: int) -> str:
+def checkpoint_prefix(root: str, stage: str, token: int, number: int) -> str:
     """One checkpoint: the claim's token and its number within the claim."""
-    return f"{stage_prefix(job_id, stage)}checkpoint/{token}-{number}/"
+    return f"{stage_prefix(root, stage)}checkpoint/{token}-{number}/"
+
+
+def place_of(key: str) -> Place | None:
+    """Where this object lies; None for a key of no such form."""
+    parts = key.split("/")
+    start = 2 if parts[0] == "tenants" else 0
+    kind, inner = (parts[start : start + 1] or [""])[0], parts[start + 1 :]
+    if kind == ("blobs" if start else "captures") and len(inner) > 1:
+        return Place("/".join(parts[: start + 2]) + "/")
+    if kind != "jobs" or len(inner) < 3:
+        return None
+    is_checkpoint = inner[2] == "checkpoint"
+    length = 4 if is_checkpoint else 3
+    if len(inner) <= length:
+        return None
+    first, _, second = inner[length - 1].partition("-")
+    token = first if is_checkpoint else second
+    if not token.isdecimal():
+        return None
+    root, folder = parts[: start + 2], parts[: start + 1 + length]
+    return Place("/".join(folder) + "/", "/".join(root) + "/", inner[1], int(token))
 
 
 def token_of(key: str) -> int | None:
     """The token of the claim that wrote this object of a stage; None for other keys."""
-    parts = key.split("/")
-    if len(parts) < 5 or parts[0] != "jobs":
-        return None
-    first, _, second = (parts[4] if parts[3] == "checkpoint" else parts[3]).partition("-")
-    token = first if parts[3] == "checkpoint" else second
-    return int(token) if token.isdecimal() else None
+    place = place_of(key)
+    return None if place is None else place.token
 
 
 def folder_of(key: str) -> str | None:
     """The prefix that a record would name for this object; None for a key of no such form."""
-    parts = key.split("/")
-    if parts[0] == "captures" and len(parts) > 2:
-        return "/".join(parts[:2]) + "/"
-    if parts[0] != "jobs" or token_of(key) is None:
-        return None
-    length = 5 if parts[3] == "checkpoint" else 4
-    return "/".join(parts[:length]) + "/" if len(parts) > length else None
+    place = place_of(key)
+    return None if place is None else place.folder

@@ -154,15 +154,22 @@ def succeed_stage(
     if earlier is not None:
         return [other.id for other in stages if other.state == "ready"]
     when = when or now(session)
+    fingerprint = manifest.get("fingerprint")
     set_stage(
         session,
         row,
         "succeeded",
         when,
-        run=RunEnd("succeeded", peak_bytes=peak_bytes),
+        run=RunEnd(
+            "succeeded",
+            peak_bytes=peak_bytes,
+            output_prefix=output_prefix,
+            fingerprint=fingerprint,
+        ),
         manifest=manifest,
         summary=manifest.get("summary"),
         output_prefix=output_prefix,
+        fingerprint=fingerprint,
         checkpoint_prefix=None,
         progress=1.0,
         progress_at=when,

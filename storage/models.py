@@ -26,6 +26,10 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
 from storage.db import CleanJson, CleanText, UtcDateTime
 
+TENANT_LENGTH = 28
+DEFAULT_TENANT = "default"
+"""Whose everything is, for now: rows and object keys say it, so that there can be more than one."""
+
 _BIG = BigInteger().with_variant(Integer(), "sqlite")  # only INTEGER counts up by itself there
 ID_LENGTH = 28
 _ID = re.compile(rf"[0-9a-f]{{{ID_LENGTH}}}", re.ASCII)
@@ -54,12 +58,39 @@ class Base(DeclarativeBase):
     )
 
 
+class Blob(Base):
+    """Bytes in the object store, and how many captures are made of them (`storage.blobs`).
+
+    sha256: of the bytes; a tenant's second upload of the same is one reference more. None where
+    they lie twice, from the time before blobs: those of the second are not shared.
+    """
+
+    __tablename__ = "blobs"
+
+    id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    object_key: Mapped[str] = mapped_column(String(255))
+    refs: Mapped[int] = mapped_column(Integer)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+    __table_args__ = (
+        Index(None, "tenant_id", "sha256", unique=True),
+        Index(None, "object_key", unique=True),
+    )
+
+
 class Capture(Base):
-    """Uploaded bytes. A deleted one stays as a tombstone for the jobs that speak of it."""
+    """An upload. A deleted one stays as a tombstone for the jobs that speak of it.
+
+    blob_id: its bytes; None once it is deleted. object_key: where they lie, or lay.
+    """
 
     __tablename__ = "captures"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
+    blob_id: Mapped[str | None] = mapped_column(ForeignKey("blobs.id"), index=True)
     filename: Mapped[str] = mapped_column(CleanText(255))
     kind: Mapped[str] = mapped_column(String(32))
     bytes: Mapped[int] = mapped_column(BigInteger)
@@ -75,12 +106,15 @@ class Capture(Base):
 class Job(Base):
     """The stages on one capture, or an export of another job's results (`storage.exports`).
 
-    parent_id: the job that an export is of. generation: 1, and one more with every retry.
+    parent_id: the job that an export is of. generation: 1, and one more with every retry. options:
+    of the present generation. object_root: the prefix of all its bytes.
     """
 
     __tablename__ = "jobs"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
+    object_root: Mapped[str] = mapped_column(String(255))
     capture_id: Mapped[str] = mapped_column(ForeignKey("captures.id"), index=True)
     parent_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
     state: Mapped[str] = mapped_column(String(16))
@@ -107,6 +141,22 @@ class Job(Base):
     )
 
 
+class JobGeneration(Base):
+    """What a job was asked for, the first time and with every retry: what a retry overwrites.
+
+    options: of all stages, as this generation ran them. from_stage: the one that its retry named.
+    """
+
+    __tablename__ = "job_generations"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    generation: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
+    options: Mapped[dict[str, Any]] = mapped_column(CleanJson)
+    from_stage: Mapped[str | None] = mapped_column(String(32))
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
 class StageRow(Base):
     """One stage of one job, and its lease.
 
@@ -114,11 +164,13 @@ class StageRow(Base):
     or "gpu". attempt: claims in this generation of the job, without those that were released.
     not_before: when a retry may start. ready_at: since when it could run. rung_at: when the bell
     last rang for it. progress_at: when it last got on. manifest: what `manifest.json` holds.
+    fingerprint: all that its result depends on, as one number; a retry asks whether it is the same.
     """
 
     __tablename__ = "stages"
 
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     name: Mapped[str] = mapped_column(String(32))
     seq: Mapped[int] = mapped_column(Integer)
@@ -147,6 +199,7 @@ class StageRow(Base):
     manifest: Mapped[dict[str, Any] | None] = mapped_column(
         CleanJson(none_as_null=True), deferred=True
     )
+    fingerprint: Mapped[str | None] = mapped_column(CleanText(64))
     checkpoint_prefix: Mapped[str | None] = mapped_column(String(255))
 
     __table_args__ = (
@@ -162,12 +215,13 @@ class StageRun(Base):
     owner: the worker's id and its boot nonce. outcome: how it ended (`storage.runs.OUTCOMES`), None
     while it runs. led_to: the state that its end put the stage into. checkpoints: how many it
     saved. exit_code: of the stage's process, negative for a signal. peak_bytes: the most memory
-    that process held.
+    that process held. output_prefix, fingerprint: of what it published, where it succeeded.
     """
 
     __tablename__ = "stage_runs"
 
     id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     stage: Mapped[str] = mapped_column(String(32))
     token: Mapped[int] = mapped_column(Integer)
@@ -182,6 +236,8 @@ class StageRun(Base):
     error: Mapped[dict[str, Any] | None] = mapped_column(CleanJson(none_as_null=True))
     exit_code: Mapped[int | None] = mapped_column(Integer)
     peak_bytes: Mapped[int | None] = mapped_column(BigInteger)
+    output_prefix: Mapped[str | None] = mapped_column(String(255))
+    fingerprint: Mapped[str | None] = mapped_column(CleanText(64))
 
     __table_args__ = (Index(None, "job_id", "stage", "token", unique=True),)
 
@@ -196,6 +252,7 @@ class Event(Base):
     __tablename__ = "events"
 
     seq: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     stage: Mapped[str | None] = mapped_column(String(32))
     kind: Mapped[str] = mapped_column(String(48))
@@ -213,6 +270,7 @@ class LogLine(Base):
     __tablename__ = "log_lines"
 
     id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     stage: Mapped[str] = mapped_column(String(32))
     attempt: Mapped[int] = mapped_column(Integer)
@@ -223,7 +281,7 @@ class LogLine(Base):
 
 
 class Worker(Base):
-    """A worker process and what it has. It is live while `seen_at` is fresh.
+    """A worker process and what it has. It is live while `seen_at` is fresh. It serves all tenants.
 
     boot: chance, made when the process starts; tells two that were given one id apart.
     """
@@ -242,11 +300,12 @@ class Worker(Base):
 
 
 class ApiKey(Base):
-    """A key of the API: only its SHA-256 is kept."""
+    """A key of the API: only its SHA-256 is kept. What is made with it is its tenant's."""
 
     __tablename__ = "api_keys"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
+    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
     name: Mapped[str] = mapped_column(CleanText(100))
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
@@ -255,7 +314,10 @@ class ApiKey(Base):
 
 
 class PendingDeletion(Base):
-    """Bytes whose record is gone: kept until the object store has dropped them too."""
+    """Bytes whose record is gone: kept until the object store has dropped them too.
+
+    Whose they were, the prefix says.
+    """
 
     __tablename__ = "pending_deletions"
 
@@ -267,8 +329,9 @@ class PendingDeletion(Base):
 class IdempotentCall(Base):
     """A call that creates something, under its caller's key (`storage.idempotency`).
 
-    id: hash of caller, call and key. fingerprint: of what was asked. token, held_until: who works
-    on it, and until when. status, body, location: the answer, once there is one.
+    id: hash of caller (a key of the API, and so a tenant), call and key. fingerprint: of what was
+    asked. token, held_until: who works on it, and until when. status, body, location: the answer,
+    once there is one.
     """
 
     __tablename__ = "idempotent_calls"

@@ -17,12 +17,11 @@ from sqlalchemy.orm import Session
 
 from storage.db import Database, now
 from storage.errors import ObjectStoreError
-from storage.keys import folder_of, token_of
-from storage.models import Capture, PendingDeletion, StageRow
+from storage.keys import ROOTS, folder_of, place_of
+from storage.models import Blob, Job, PendingDeletion, StageRow
 from storage.objects import ObjectStore
 
 DAY = timedelta(days=1)
-ROOTS = ("captures/", "jobs/")
 BATCH = 200
 
 _log = logging.getLogger("nerfworks.storage")
@@ -78,27 +77,25 @@ def _folders(store: ObjectStore) -> Iterator[tuple[str, datetime]]:
 
 def _spoken_for(session: Session, prefixes: list[str]) -> set[str]:
     """Of these folders, those that a record names, a running stage may write, or are to go."""
-    ids = {prefix.split("/")[1] for prefix in prefixes}
-    captures = select(Capture.object_key).where(Capture.id.in_(ids), Capture.deleted_at.is_(None))
-    named = {folder_of(key) or key for key in session.scalars(captures)}
-    rows = session.scalars(select(StageRow).where(StageRow.job_id.in_(ids))).all()
-    named |= {row.output_prefix for row in rows if row.output_prefix}
-    named |= {row.checkpoint_prefix for row in rows if row.checkpoint_prefix}
-    running = {(row.job_id, row.name): row.lease_token for row in rows if row.state == "running"}
-    for prefix in prefixes:
-        parts = prefix.split("/")
-        token = token_of(f"{prefix}-")
-        if token is not None and running.get((parts[1], parts[2])) == token:
-            named.add(prefix)
-    named |= set(
-        session.scalars(
-            select(PendingDeletion.prefix).where(
-                PendingDeletion.prefix.in_([*prefixes, *(f"jobs/{one}/" for one in ids)])
-            )
-        )
+    places = {prefix: place for prefix in prefixes if (place := place_of(f"{prefix}-")) is not None}
+    roots = {place.root for place in places.values() if place.root is not None}
+    blobs = select(Blob.object_key).where(
+        Blob.object_key.in_([f"{one}content" for one in prefixes])
     )
-    return {
+    named = {folder_of(key) or key for key in session.scalars(blobs)}
+    found = session.execute(
+        select(StageRow, Job.object_root)
+        .join(Job, Job.id == StageRow.job_id)
+        .where(Job.id.in_({root.split("/")[-2] for root in roots}), Job.object_root.in_(roots))
+    ).all()
+    named |= {row.output_prefix for row, _ in found if row.output_prefix}
+    named |= {row.checkpoint_prefix for row, _ in found if row.checkpoint_prefix}
+    running = {(root, row.name, row.lease_token) for row, root in found if row.state == "running"}
+    named |= {
         prefix
-        for prefix in prefixes
-        if prefix in named or "/".join(prefix.split("/")[:2]) + "/" in named
+        for prefix, place in places.items()
+        if (place.root, place.stage, place.token) in running
     }
+    waiting = select(PendingDeletion.prefix).where(PendingDeletion.prefix.in_({*prefixes, *roots}))
+    named |= set(session.scalars(waiting))
+    return {prefix for prefix, place in places.items() if {prefix, place.root} & named}

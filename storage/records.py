@@ -10,11 +10,11 @@ from typing import Any
 from sqlalchemy import delete, func, insert, select
 from sqlalchemy.orm import Session
 
+from storage.blobs import drop_blob, take_blob
 from storage.claims import Claim
 from storage.db import clean_text, now
 from storage.errors import ConflictError, NotFoundError
-from storage.keys import capture_prefix
-from storage.models import Capture, Job, LogLine, PendingDeletion, StageRow, Worker
+from storage.models import DEFAULT_TENANT, Capture, Job, LogLine, StageRow, Worker
 from storage.states import JOB_LIVE
 
 WORKER_LIVE_S = 60.0
@@ -39,20 +39,30 @@ def create_capture(
     kind: str,
     num_bytes: int,
     sha256: str,
-    object_key: str,
+    brought: str | None,
     details: dict[str, Any],
+    tenant_id: str = DEFAULT_TENANT,
     when: datetime | None = None,
 ) -> Capture:
-    """Record uploaded bytes that are in the object store already."""
+    """Record an upload whose bytes are in the object store already.
+
+    brought: the key under which the caller has put them, or None where it relies on what is there
+    (`storage.blobs.take_blob`; raises BlobMissingError). The capture's `object_key` says which of
+    the two count: where it is not `brought`, the caller deletes that.
+    """
+    when = when or now(session)
+    blob_id, object_key = take_blob(session, tenant_id, sha256, brought, when)
     capture = Capture(
         id=capture_id,
+        tenant_id=tenant_id,
+        blob_id=blob_id,
         filename=filename,
         kind=kind,
         bytes=num_bytes,
         sha256=sha256,
         object_key=object_key,
         details=details,
-        created_at=when or now(session),
+        created_at=when,
     )
     session.add(capture)
     session.flush()
@@ -68,7 +78,7 @@ def get_capture(session: Session, capture_id: str) -> Capture:
 
 
 def delete_capture(session: Session, capture_id: str, when: datetime | None = None) -> None:
-    """Delete a capture and put its bytes up for deletion (`storage.deletions`).
+    """Delete a capture, and its bytes where no other capture has them (`storage.blobs`).
 
     Finished jobs keep their results, and exports of them need no capture. Raises ConflictError
     while a job on it is not over.
@@ -83,8 +93,10 @@ def delete_capture(session: Session, capture_id: str, when: datetime | None = No
     if session.scalars(live).one():
         raise ConflictError(f"A job is running on capture {capture_id}; cancel it first.")
     when = when or now(session)
-    capture.deleted_at = when
-    session.add(PendingDeletion(prefix=capture_prefix(capture_id), created_at=when))
+    blob_id, capture.blob_id, capture.deleted_at = capture.blob_id, None, when
+    session.flush()
+    if blob_id is not None:
+        drop_blob(session, blob_id, when)
 
 
 def register_worker(
@@ -154,9 +166,9 @@ def append_logs(
     None of a claim that another one has replaced, or whose job was deleted. Until the lines are
     committed nobody deletes the job.
     """
-    token = select(StageRow.lease_token).where(StageRow.id == claim.stage_id)
-    latest = session.scalar(token.with_for_update(read=True, key_share=True))
-    if latest is None or latest > claim.token:
+    query = select(StageRow.lease_token, StageRow.tenant_id).where(StageRow.id == claim.stage_id)
+    row = session.execute(query.with_for_update(read=True, key_share=True)).one_or_none()
+    if row is None or row.lease_token > claim.token:
         return 0
     mine = (LogLine.job_id == claim.job_id, LogLine.stage == claim.name)
     held = session.scalars(select(func.count()).select_from(LogLine).where(*mine)).one()
@@ -167,6 +179,7 @@ def append_logs(
     if kept:
         moment = when or now(session)
         common = {
+            "tenant_id": row.tenant_id,
             "job_id": claim.job_id,
             "stage": claim.name,
             "attempt": claim.attempt,

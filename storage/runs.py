@@ -1,9 +1,9 @@
-"""The history of claims: one row for each, which no later claim overwrites.
+"""The history of a job: a row for each claim and each generation, which no later one overwrites.
 
-Two things are read from it. Whether an operation that ends a claim has been recorded before: after
-a COMMIT whose answer was lost it is repeated, and must then change nothing. And how often a stage
-ended in one way since it last got on: each cause has a cap of its own, and a run that saved a
-checkpoint starts the counts anew.
+Two things are read from the claims. Whether an operation that ends a claim has been recorded
+before: after a COMMIT whose answer was lost it is repeated, and must then change nothing. And how
+often a stage ended in one way since it last got on: each cause has a cap of its own, and a run that
+saved a checkpoint starts the counts anew.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from storage.models import StageRow, StageRun
+from storage.models import Job, JobGeneration, StageRow, StageRun
 
 OUTCOMES = (
     "succeeded",
@@ -34,21 +34,22 @@ OUTCOMES = (
 @dataclass(frozen=True)
 class RunEnd:
     """How a claim ended. exit_code: of the process, negative for a signal. peak_bytes: the most
-    memory that it held; both None where nobody knows."""
+    memory that it held; both None where nobody knows. output_prefix, fingerprint: of its result."""
 
     outcome: str
     error: dict[str, Any] | None = None
     exit_code: int | None = None
     peak_bytes: int | None = None
+    output_prefix: str | None = None
+    fingerprint: str | None = None
 
 
 def start_run(
     session: Session,
+    job: Job,
     *,
-    job_id: str,
     stage: str,
     token: int,
-    generation: int,
     attempt: int,
     owner: str,
     when: datetime,
@@ -56,14 +57,31 @@ def start_run(
     """Note that a claim was made."""
     session.add(
         StageRun(
-            job_id=job_id,
+            tenant_id=job.tenant_id,
+            job_id=job.id,
             stage=stage,
             token=token,
-            generation=generation,
+            generation=job.generation,
             attempt=attempt,
             owner=owner,
             started_at=when,
             checkpoints=0,
+        )
+    )
+
+
+def start_generation(
+    session: Session, job: Job, when: datetime, from_stage: str | None = None
+) -> None:
+    """Note what the job is asked for from now on."""
+    session.add(
+        JobGeneration(
+            job_id=job.id,
+            generation=job.generation,
+            tenant_id=job.tenant_id,
+            options=job.options,
+            from_stage=from_stage,
+            created_at=when,
         )
     )
 
@@ -87,6 +105,8 @@ def end_run(session: Session, row: StageRow, end: RunEnd, led_to: str, when: dat
             error=end.error,
             exit_code=end.exit_code,
             peak_bytes=end.peak_bytes,
+            output_prefix=end.output_prefix,
+            fingerprint=end.fingerprint,
         )
         .execution_options(synchronize_session=False)
     )
@@ -145,3 +165,9 @@ def list_runs(session: Session, job_id: str) -> list[StageRun]:
     """All claims of a job's stages, oldest first."""
     query = select(StageRun).where(StageRun.job_id == job_id).order_by(StageRun.id)
     return list(session.scalars(query))
+
+
+def list_generations(session: Session, job_id: str) -> list[JobGeneration]:
+    """What a job was asked for, from the first time on."""
+    query = select(JobGeneration).where(JobGeneration.job_id == job_id)
+    return list(session.scalars(query.order_by(JobGeneration.generation)))

@@ -25,18 +25,22 @@ from storage.states import JOB_TERMINAL, STAGE_DONE, check_transition
 
 def record_event(
     session: Session,
-    job_id: str,
+    of: Job | StageRow,
     kind: str,
     when: datetime,
     stage: str | None = None,
     reason: str = "",
     **data: Any,
 ) -> None:
-    """Note what happened, under the session's actor (`Database.session_scope`)."""
+    """Note what happened, under the session's actor (`Database.session_scope`).
+
+    of: the job; or the stage, which the event then names.
+    """
     session.add(
         Event(
-            job_id=job_id,
-            stage=stage,
+            tenant_id=of.tenant_id,
+            job_id=of.job_id if isinstance(of, StageRow) else of.id,
+            stage=of.name if isinstance(of, StageRow) else stage,
             kind=kind,
             actor=session.info.get(ACTOR, "service"),
             reason=reason,
@@ -113,7 +117,7 @@ def set_stage(
     if values.get("error"):
         data["error"] = values["error"]
         reason = reason or str(values["error"].get("code", ""))
-    record_event(session, row.job_id, f"stage.{state}", when, row.name, reason, was=old, **data)
+    record_event(session, row, f"stage.{state}", when, reason=reason, was=old, **data)
 
 
 def set_job(
@@ -137,7 +141,7 @@ def set_job(
         raise ConflictError(f"job {job.id} is no longer {old}")
     if values.get("error"):
         reason = reason or str(values["error"].get("code", ""))
-    record_event(session, job.id, f"job.{state}", when, reason=reason, was=old, **data)
+    record_event(session, job, f"job.{state}", when, reason=reason, was=old, **data)
 
 
 def _is_done(name: str, by_name: dict[str, StageRow]) -> bool:

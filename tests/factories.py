@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -10,8 +11,8 @@ from sqlalchemy.orm import Session
 
 from storage.db import Database
 from storage.jobs import StageSeed, create_job
-from storage.keys import capture_content
-from storage.models import Base, Capture, Job, StageRow, new_id
+from storage.keys import blob_content, job_root
+from storage.models import DEFAULT_TENANT, Base, Capture, Job, StageRow, new_id
 from storage.records import create_capture
 from storage.schema import upgrade
 
@@ -22,6 +23,11 @@ DIAMOND = (
     StageSeed("right", ("first",)),
     StageSeed("last", ("left", "right")),
 )
+
+
+def root_of(job_id: str) -> str:
+    """Below which a job's bytes lie."""
+    return job_root(DEFAULT_TENANT, job_id)
 
 
 def make_database(folder: Path) -> Database:
@@ -38,18 +44,27 @@ def empty(database: Database) -> None:
         connection.exec_driver_sql(f"TRUNCATE {tables} CASCADE")
 
 
-def make_capture(session: Session, *, when: datetime | None = None, num_bytes: int = 3) -> Capture:
-    """A capture; its bytes are not in any store."""
+def make_capture(
+    session: Session,
+    *,
+    when: datetime | None = None,
+    num_bytes: int = 3,
+    sha256: str = "",
+    tenant_id: str = DEFAULT_TENANT,
+) -> Capture:
+    """A capture of bytes of its own, or of those with this hash; they are not in any store."""
     capture_id = new_id()
+    sha256 = sha256 or secrets.token_hex(32)
     return create_capture(
         session,
         capture_id=capture_id,
         filename="walk.mp4",
         kind="video",
         num_bytes=num_bytes,
-        sha256="0" * 64,
-        object_key=capture_content(capture_id),
+        sha256=sha256,
+        brought=blob_content(tenant_id, sha256, capture_id),
         details={},
+        tenant_id=tenant_id,
         when=when,
     )
 

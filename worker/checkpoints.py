@@ -119,7 +119,7 @@ class CheckpointUploader:
     def _upload(self, snapshot: Snapshot) -> None:
         claim = self._claim
         self._number += 1
-        prefix = keys.checkpoint_prefix(claim.job_id, claim.name, claim.token, self._number)
+        prefix = keys.checkpoint_prefix(claim.root, claim.name, claim.token, self._number)
         try:
             upload_folder(
                 self._store,

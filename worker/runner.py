@@ -192,7 +192,7 @@ class Runner:
     def run(self, claim: Claim) -> list[str]:
         """Run a claimed stage to its recorded end. Ids of stages that became ready."""
         _log.info("%s: attempt %d", claim.stage_id, claim.attempt)
-        prefix = keys.attempt_prefix(claim.job_id, claim.name, claim.attempt, claim.token)
+        prefix = keys.attempt_prefix(claim.root, claim.name, claim.attempt, claim.token)
         with LeaseKeeper(self._database, claim, self._settings) as keeper:
             try:
                 manifest = self._attempt(claim, keeper, prefix)
@@ -222,7 +222,7 @@ class Runner:
             _log.info("%s: %s", claim.stage_id, ready or "cancelled")
             return []
         _log.info("%s: succeeded", claim.stage_id)
-        self._discard(claim, keys.stage_prefix(claim.job_id, claim.name), keep=prefix)
+        self._discard(claim, keys.stage_prefix(claim.root, claim.name), keep=prefix)
         reached("finish.tidied")
         return ready
 

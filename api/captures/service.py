@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import dataclass
+
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 from starlette.responses import Response
@@ -9,10 +12,13 @@ from starlette.responses import Response
 from api.captures.receiving import Received
 from api.captures.schemas import CaptureView
 from api.deps import DELETE_WAIT_S, Services
-from api.idempotency import Once, do_once
-from pipelines.captures.sniff import sniff
+from api.idempotency import Done, Once, do_once
+from pipelines.captures.sniff import Sniffed, sniff
 from storage import records
-from storage.keys import capture_content, capture_prefix
+from storage.api_keys import tenant_of
+from storage.blobs import find_blob
+from storage.errors import BlobMissingError, ObjectStoreError
+from storage.keys import blob_content
 from storage.models import new_id
 from storage.steps import reached
 
@@ -20,39 +26,76 @@ from storage.steps import reached
 def keep(services: Services, received: Received, once: Once) -> Response:
     """Look at a received file, store its bytes, then record it, once. Returns the answer.
 
-    The record comes last, so that there is never one without bytes. Bytes that no record speaks of
-    are taken away again; where it is not known whether there is one, because the database did not
-    say, they stay for the sweep (`storage.reconciling`). Raises CaptureError for a file that is of
-    no use.
+    Bytes that are here already are not stored again (`storage.blobs`). Raises CaptureError for a
+    file that is of no use.
     """
     sniffed = sniff(received.path, received.filename)
-    capture_id = new_id()
-    key = capture_content(capture_id)
+    with services.database.read_scope() as session:
+        tenant_id = tenant_of(session, once.caller)
+        found = find_blob(session, tenant_id, received.sha256)
+    upload = _Upload(services, received, sniffed, tenant_id, once)
+    if found is not None:
+        with contextlib.suppress(BlobMissingError):  # it went since: these are needed after all
+            if not services.store.exists(found.object_key):
+                services.store.put_file(found.object_key, received.path)  # it had been lost
+            return upload.record(brought=None)[0].response
+    return _store_and_record(upload)
 
-    def make(session: Session) -> tuple[CaptureView, str]:
-        capture = records.create_capture(
-            session,
-            capture_id=capture_id,
-            filename=received.filename,
-            kind=sniffed.kind,
-            num_bytes=received.bytes,
-            sha256=received.sha256,
-            object_key=key,
-            details=sniffed.details,
-        )
-        return CaptureView.of(capture), f"/v1/captures/{capture_id}"
 
+@dataclass(frozen=True)
+class _Upload:
+    """What is to be recorded, and by whom."""
+
+    services: Services
+    received: Received
+    sniffed: Sniffed
+    tenant_id: str
+    once: Once
+
+    def record(self, brought: str | None) -> tuple[Done, str | None]:
+        """Make the record. The answer, and the key that it names; None where it was made before."""
+        key: str | None = None
+
+        def make(session: Session) -> tuple[CaptureView, str]:
+            nonlocal key
+            capture = records.create_capture(
+                session,
+                capture_id=new_id(),
+                filename=self.received.filename,
+                kind=self.sniffed.kind,
+                num_bytes=self.received.bytes,
+                sha256=self.received.sha256,
+                brought=brought,
+                details=self.sniffed.details,
+                tenant_id=self.tenant_id,
+            )
+            key = capture.object_key
+            return CaptureView.of(capture), f"/v1/captures/{capture.id}"
+
+        return do_once(self.services, self.once, 201, make), key
+
+
+def _store_and_record(upload: _Upload) -> Response:
+    """The record comes last, so that there is never one without bytes.
+
+    Bytes that no record speaks of are taken away again; where it is not known whether there is one,
+    because the database did not say, they stay for the sweep (`storage.reconciling`).
+    """
+    store = upload.services.store
+    key = blob_content(upload.tenant_id, upload.received.sha256, new_id())
+    folder = key.removesuffix("content")
     try:
-        services.store.put_file(key, received.path)
+        store.put_file(key, upload.received.path)
         reached("capture.put")
-        done = do_once(services, once, 201, make)
+        done, named = upload.record(brought=key)
     except DBAPIError:
         raise
     except BaseException:
-        services.store.delete_prefix(capture_prefix(capture_id))
+        store.delete_prefix(folder)
         raise
-    if done.is_replayed:
-        services.store.delete_prefix(capture_prefix(capture_id))
+    if named != key:  # made before, or others brought the same meanwhile
+        with contextlib.suppress(ObjectStoreError):  # the sweep will find it
+            store.delete_prefix(folder)
     return done.response
 
 

@@ -24,7 +24,7 @@ def _holds(row: StageRow, rows: Mapping[str, StageRow], options: dict[str, Any],
     made = row.manifest
     if row.state != "succeeded" or made is None or row.name not in STAGE_NAMES:
         return False
-    if not {"fingerprint", "inputs"} <= set(made):
+    if row.fingerprint is None or "inputs" not in made:
         return False
     inputs: dict[str, dict[str, Any]] = {}
     for name, content in made["inputs"].items():
@@ -33,7 +33,7 @@ def _holds(row: StageRow, rows: Mapping[str, StageRow], options: dict[str, Any],
             return False
         inputs[name] = found
     wanted = fingerprint(get_stage(row.name), options, inputs, seed=seed)
-    return bool(wanted == made["fingerprint"])
+    return wanted == row.fingerprint
 
 
 def stages_to_redo(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -15,8 +16,8 @@ from typing import Any
 from storage.bell import Bell
 from storage.db import Database
 from storage.jobs import StageSeed, create_job, ready_stage_ids, request_cancel
-from storage.keys import capture_content
-from storage.models import Job, StageRow, new_id
+from storage.keys import blob_content
+from storage.models import DEFAULT_TENANT, Job, StageRow, new_id
 from storage.objects import ObjectStore
 from storage.open_objects import open_object_store
 from storage.queries import get_job
@@ -95,7 +96,9 @@ class Engine:
         source = self.folder / "capture.json"
         source.write_bytes(content)
         capture_id = new_id()
-        self.store.put_file(capture_content(capture_id), source)
+        sha256 = hashlib.sha256(content).hexdigest()
+        key = blob_content(DEFAULT_TENANT, sha256, capture_id)
+        self.store.put_file(key, source)
         with self.database.session_scope() as session:
             create_capture(
                 session,
@@ -103,8 +106,8 @@ class Engine:
                 filename="plan.json",
                 kind="video",
                 num_bytes=len(content),
-                sha256="0" * 64,
-                object_key=capture_content(capture_id),
+                sha256=sha256,
+                brought=key,
                 details={},
             )
             job = create_job(

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from storage.keys import stage_prefix
+from tests.factories import root_of
 from tests.integration.engine import Engine, is_running
 from tests.integration.toy_stages import STAGES
 from tests.services import RedisServer
@@ -37,7 +39,7 @@ def test_a_job_goes_through_all_stages_once(engine: Engine) -> None:
     assert report.summary == {"steps": 2, "first": 0, "read": ["ingest", "train", "mesh", "video"]}
     assert report.output_prefix is not None
     assert f"{report.output_prefix}manifest.json" in list(engine.store.list(report.output_prefix))
-    assert f"{report.output_prefix}deep/result ä.txt" in list(engine.store.list(f"jobs/{job_id}/"))
+    assert f"{report.output_prefix}deep/result ä.txt" in list(engine.store.list(root_of(job_id)))
     assert "train step 2" in engine.log(job_id, "train")
     pids = {line.split()[-1] for line in engine.notes("") if " start " in line}
     assert len(pids) == 1, "one warm process serves all stages of a slot"
@@ -158,7 +160,7 @@ def test_a_killed_stage_process_resumes_from_its_checkpoint(engine: Engine) -> N
     assert train.summary["first"] >= 5
     assert len(engine.notes("train resume")) == 1
     assert all(len(engine.notes(f"{stage.name} end")) == 1 for stage in STAGES)
-    kept = list(engine.store.list(f"jobs/{job_id}/train/"))
+    kept = list(engine.store.list(stage_prefix(root_of(job_id), "train")))
     assert all(key.startswith(str(train.output_prefix)) for key in kept), "checkpoints are gone"
 
 
@@ -173,7 +175,7 @@ def test_a_stage_that_crashes_each_time_fails_the_job(engine: Engine) -> None:
     train = engine.stage(job_id, "train")
     report = json.loads(b"".join(engine.store.read(f"{train.output_prefix}report.json")))
     assert (report["error"]["code"], report["failed_report"]) == ("worker_lost", None)
-    kept = list(engine.store.list(f"jobs/{job_id}/train/"))
+    kept = list(engine.store.list(stage_prefix(root_of(job_id), "train")))
     assert kept == [f"{train.output_prefix}report.json"], "those of the first two crashes are gone"
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from storage.errors import ObjectMissingError, ObjectStoreError
-from storage.keys import capture_content
+from storage.keys import blob_content
 from storage.objects import ObjectStore
 from storage.objects_s3 import S3ObjectStore
 from storage.open_objects import open_object_store
@@ -120,7 +120,8 @@ def test_only_our_own_half_done_uploads_are_dropped(
     store = open_object_store(StorageSettings())
     assert isinstance(store, S3ObjectStore)
     below = f"{prefix}/" if prefix else ""
-    ours = {below + key for key in (capture_content("c"), "jobs/j/train/1-2/model.zip")}
+    keys = (blob_content("t", "c", "n"), "captures/c/content", "jobs/j/train/1-2/model.zip")
+    ours = {below + key for key in keys}
     theirs = {below + key for key in ("backups/db.tar", "jobs/notes.txt", "jobs/a/b/c/d")}
     for key in ours | theirs:
         store._client.create_multipart_upload(Bucket=s3_endpoint.bucket, Key=key)

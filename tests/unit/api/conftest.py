@@ -33,6 +33,7 @@ from storage.keys import attempt_prefix
 from storage.leases import succeed_stage
 from storage.models import Job
 from storage.queries import get_job
+from tests.factories import root_of
 from tests.services import free_port
 
 KEY = "nw_test_key_for_the_unit_tests"
@@ -113,7 +114,7 @@ def run_stage(services: Services, job_id: str, name: str, files: dict[str, bytes
     with services.database.session_scope() as session:
         claim = claim_stage(session, stage_id(job_id, name), "test", LEASE_S)
     assert claim is not None, f"{name} is not ready"
-    prefix = attempt_prefix(job_id, name, claim.attempt, claim.token)
+    prefix = attempt_prefix(root_of(job_id), name, claim.attempt, claim.token)
     entries = []
     for path, content in files.items():
         source = services.settings.home / "published"

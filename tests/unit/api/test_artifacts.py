@@ -22,6 +22,7 @@ from storage.jobs import stage_id
 from storage.keys import attempt_prefix
 from storage.leases import FailureReport, fail_stage
 from storage.signed_urls import SignedObject, make_object_token
+from tests.factories import root_of
 from tests.unit.api.conftest import Service, finish_job, problem, serving, settings_for
 
 CONTENT = bytes(range(256)) * 40
@@ -61,7 +62,7 @@ def test_list_names_every_artifact_of_the_registry(done: tuple[Service, str]) ->
 def test_the_report_of_a_job_that_failed_can_be_downloaded(tmp_path: Path) -> None:
     with serving(settings_for(tmp_path)) as service:
         job_id = service.job()["id"]
-        prefix = attempt_prefix(job_id, "ingest", 1, 1)
+        prefix = attempt_prefix(root_of(job_id), "ingest", 1, 1)
         source = tmp_path / "report"
         source.write_bytes(CONTENT)
         service.services.store.put_file(f"{prefix}report.json", source)

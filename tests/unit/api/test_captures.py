@@ -11,6 +11,7 @@ import time
 import tracemalloc
 import zipfile
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ from api.captures.receiving import (
     sweep,
 )
 from api.problems import ApiError
+from storage.models import Capture
+from storage.objects_local import LocalObjectStore
 from tests.unit.api.conftest import (
     KEY,
     LiveServer,
@@ -90,6 +93,67 @@ def test_deleted_capture_is_gone_with_its_bytes(service: Service) -> None:
     problem(service.http.get(f"/v1/captures/{made['id']}"), 404, "capture_not_found")
     problem(service.http.delete(f"/v1/captures/{made['id']}"), 404, "capture_not_found")
     assert service.http.get("/v1/captures").json()["items"] == []
+
+
+def test_the_same_file_twice_is_stored_once_and_goes_with_the_last_capture(
+    service: Service,
+) -> None:
+    content = zip_of_pictures()
+    first, second = service.upload(content), service.upload(content, "again.zip")
+    assert first["id"] != second["id"]
+    assert second["filename"] == "again.zip"
+    (kept,) = service.objects()
+    assert service.http.delete(f"/v1/captures/{first['id']}").status_code == 204
+    assert service.objects() == [kept]
+    job = service.job(second["id"])
+    with service.services.database.read_scope() as session:
+        capture = session.get_one(Capture, job["capture_id"])
+        assert b"".join(service.services.store.read(capture.object_key)) == content
+    service.http.post(f"/v1/jobs/{job['id']}/cancel")
+    assert service.http.delete(f"/v1/captures/{second['id']}").status_code == 204
+    assert service.objects() == []
+    service.upload(content)
+    assert len(service.objects()) == 1
+
+
+def test_bytes_that_the_store_lost_come_back_with_the_next_upload(service: Service) -> None:
+    content = zip_of_pictures()
+    service.upload(content)
+    (lost,) = service.objects()
+    lost.unlink()
+    service.upload(content)
+    assert service.objects() == [lost]
+    assert lost.read_bytes() == content
+
+
+def test_an_upload_whose_twin_is_deleted_meanwhile_is_stored_all_the_same(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found when the upload begins to be kept, gone when it is recorded."""
+    content = zip_of_pictures()
+    twin = service.upload(content)
+    look = LocalObjectStore.exists
+
+    def look_and_delete(store: LocalObjectStore, key: str) -> bool:
+        found = look(store, key)
+        assert service.http.delete(f"/v1/captures/{twin['id']}").status_code == 204
+        return found
+
+    monkeypatch.setattr(LocalObjectStore, "exists", look_and_delete)
+    service.upload(content)
+    (kept,) = service.objects()
+    assert kept.read_bytes() == content
+
+
+def test_four_uploads_of_one_file_at_once_leave_one_copy(service: Service) -> None:
+    content = zip_of_pictures()
+    with ThreadPoolExecutor(4) as pool:
+        ids = {made["id"] for made in pool.map(service.upload, [content] * 4)}
+    assert len(ids) == 4
+    assert len(service.objects()) == 1
+    for made in ids:
+        assert service.http.delete(f"/v1/captures/{made}").status_code == 204
+    assert service.objects() == []
 
 
 def test_capture_with_an_unfinished_job_is_not_deleted(service: Service) -> None:

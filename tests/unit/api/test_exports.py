@@ -13,6 +13,7 @@ from storage.jobs import stage_id
 from storage.leases import cancel_stage, fail_stage
 from storage.queries import stage_work
 from storage.records import append_logs
+from tests.factories import root_of
 from tests.unit.api.conftest import (
     LEASE_S,
     Service,
@@ -107,7 +108,7 @@ def test_the_capture_may_be_gone_and_the_inputs_are_what_the_job_made(
     assert work.is_export
     for name in ("train", *get_export("mesh").reads):
         if name != "frames":
-            assert work.inputs[name].prefix.startswith(f"jobs/{job}/{name}/")
+            assert work.inputs[name].prefix.startswith(f"{root_of(job)}{name}/")
 
 
 def test_a_capture_goes_while_an_export_runs_that_needs_it_not(service: Service, job: str) -> None:

@@ -20,7 +20,7 @@ from storage.db import Database
 from storage.jobs import StageSeed, stage_id
 from storage.keys import attempt_prefix
 from storage.leases import succeed_stage
-from tests.factories import make_job
+from tests.factories import make_job, root_of
 from tests.services import Gate, behind_gate
 from tests.unit.api.conftest import KEY, LEASE_S, problem, serving, settings_for
 
@@ -96,7 +96,7 @@ def publish_without_bytes(database: Database, job_id: str) -> None:
     with database.session_scope() as session:
         claim = claim_stage(session, stage_id(job_id, "draft"), "test", LEASE_S)
         assert claim is not None
-        prefix = attempt_prefix(job_id, "draft", claim.attempt, claim.token)
+        prefix = attempt_prefix(root_of(job_id), "draft", claim.attempt, claim.token)
         entries = [{"path": "draft.glb", "bytes": 3, "sha256": "0" * 64}]
         manifest = {"files": entries, "summary": {}}
         succeed_stage(session, claim, manifest=manifest, output_prefix=prefix)

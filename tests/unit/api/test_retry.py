@@ -13,6 +13,7 @@ from storage.claims import claim_stage
 from storage.jobs import stage_id
 from storage.keys import stage_prefix
 from storage.leases import fail_stage
+from tests.factories import root_of
 from tests.unit.api.conftest import LEASE_S, Service, finish_job, run_stage
 
 ERROR = {"code": "tool_failed", "message": "It broke.", "hint": "Mend it."}
@@ -81,7 +82,7 @@ def test_other_options_run_what_they_change_and_all_behind_it(service: Service, 
     names = {artifact["name"] for artifact in found["artifacts"]}
     assert "model.zip" in names
     assert "mesh.glb" not in names
-    kept = list(service.services.store.list(stage_prefix(job, "mesh")))
+    kept = list(service.services.store.list(stage_prefix(root_of(job), "mesh")))
     assert kept, "what it had made stays in the store until it has made it anew"
 
 

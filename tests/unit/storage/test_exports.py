@@ -10,10 +10,10 @@ from storage.db import Database
 from storage.errors import ConflictError, NotFoundError
 from storage.exports import create_export, live_exports, open_for_export
 from storage.jobs import delete_job, open_for_retry, request_cancel, retry_job
-from storage.keys import job_prefix
 from storage.models import Job, PendingDeletion
 from storage.queries import get_job, list_jobs, stage_work
 from storage.records import delete_capture
+from tests.factories import root_of
 from tests.unit.storage.committed import claim, look, new_job, seconds, succeed
 
 
@@ -78,7 +78,7 @@ def test_a_job_takes_its_exports_along_but_none_that_runs(either_database: Datab
         delete_job(session, job)
     with database.read_scope() as session:
         gone = {row.prefix for row in session.query(PendingDeletion)}
-        assert gone == {job_prefix(one) for one in (job, waits, runs)}
+        assert gone == {root_of(one) for one in (job, waits, runs)}
         for one in (job, waits, runs):
             with pytest.raises(NotFoundError):
                 get_job(session, one)

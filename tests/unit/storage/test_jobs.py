@@ -29,7 +29,7 @@ from storage.leases import (
 from storage.models import Event, Job, PendingDeletion, StageRow
 from storage.queries import get_job, is_cancel_requested, list_events, ready_unclaimed, stage_work
 from storage.runs import RunEnd, list_runs
-from tests.factories import DIAMOND, LINE, make_capture, make_job
+from tests.factories import DIAMOND, LINE, make_capture, make_job, root_of
 from tests.unit.storage.committed import (
     ERROR,
     KILLED,
@@ -349,7 +349,7 @@ def test_a_running_job_cannot_be_deleted_and_a_finished_one_leaves_nothing(
         assert session.query(Job).count() == 0
         assert session.query(StageRow).count() == 0
         assert session.query(Event).count() == 0
-        assert [row.prefix for row in session.query(PendingDeletion)] == [f"jobs/{job}/"]
+        assert [row.prefix for row in session.query(PendingDeletion)] == [root_of(job)]
     with pytest.raises(NotFoundError), database.session_scope() as session:
         delete_job(session, job)
 

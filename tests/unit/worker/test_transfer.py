@@ -167,7 +167,7 @@ def test_only_the_latest_checkpoint_is_kept_and_comes_back(
         uploader.close(finish=True, timeout_s=10)
     with database.read_scope() as session:
         prefix = session.get_one(StageRow, claim.stage_id).checkpoint_prefix
-    assert list(store.list(f"jobs/{claim.job_id}/")) == [f"{prefix}state"]
+    assert list(store.list(claim.root)) == [f"{prefix}state"]
     workspace = Workspace(tmp_path / "job")
     leftover = workspace.checkpoint("first.saved-old")
     leftover.mkdir(parents=True)
@@ -188,7 +188,7 @@ def test_a_checkpoint_that_was_written_into_is_not_kept(
     uploader = CheckpointUploader(database, store, claim, no_guard, workers=2)
     uploader.offer(snapshot)
     uploader.close(finish=True, timeout_s=10)
-    assert list(store.list(f"jobs/{claim.job_id}/")) == []
+    assert list(store.list(claim.root)) == []
     assert not snapshot.folder.exists()
 
 

@@ -17,6 +17,7 @@ from storage import keys
 from storage.claims import Claim, claim_stage
 from storage.jobs import stage_id
 from storage.leases import reap_expired
+from tests.factories import root_of
 from tests.faults import at_step, lose_answer
 from tests.integration.engine import Engine
 from worker.checkpoints import CheckpointUploader, Snapshot
@@ -82,7 +83,7 @@ def test_what_a_row_names_is_there_whatever_became_of_the_commit(
     with at_step("finish.committed" if applied else "finish.commit", lose):
         ready = slot.run(claim)
     row = engine.stage(job, "ingest")
-    uploaded = list(engine.store.list(keys.attempt_prefix(job, "ingest", 1, 1)))
+    uploaded = list(engine.store.list(keys.attempt_prefix(root_of(job), "ingest", 1, 1)))
     assert uploaded, "what the row may name must not be deleted"
     if ends_after and not applied:
         assert row.state == "running"
@@ -108,10 +109,12 @@ def test_what_the_database_refuses_is_deleted(
     with engine.database.session_scope() as session:
         reap_expired(session, datetime.now(UTC) + timedelta(seconds=61))
     later = claimed(engine, job)
-    other = keys.attempt_prefix(job, "ingest", later.attempt, later.token)
+    other = keys.attempt_prefix(root_of(job), "ingest", later.attempt, later.token)
     engine.store.put_file(f"{other}plan.json", engine.folder / "capture.json")
     assert slot.run(claim) == []
-    assert list(engine.store.list(keys.stage_prefix(job, "ingest"))) == [f"{other}plan.json"]
+    assert list(engine.store.list(keys.stage_prefix(root_of(job), "ingest"))) == [
+        f"{other}plan.json"
+    ]
 
 
 def test_a_worker_that_slept_deletes_nothing_of_a_later_claim(
@@ -120,12 +123,12 @@ def test_a_worker_that_slept_deletes_nothing_of_a_later_claim(
     """It succeeded, was frozen, and meanwhile the job was retried from this stage."""
     job = engine.submit({}, ring=False)
     claim = claimed(engine, job)
-    later = keys.attempt_prefix(job, "ingest", 1, claim.token + 1)
-    older = keys.checkpoint_prefix(job, "ingest", claim.token, 1)
+    later = keys.attempt_prefix(root_of(job), "ingest", 1, claim.token + 1)
+    older = keys.checkpoint_prefix(root_of(job), "ingest", claim.token, 1)
     for prefix in (later, older):
         engine.store.put_file(f"{prefix}file", engine.folder / "capture.json")
     assert slot.run(claim) == [stage_id(job, "frames")]
-    kept = list(engine.store.list(keys.stage_prefix(job, "ingest")))
+    kept = list(engine.store.list(keys.stage_prefix(root_of(job), "ingest")))
     assert f"{later}file" in kept
     assert f"{older}file" not in kept
 
