@@ -27,7 +27,6 @@ from storage.claims import Claim, claim_next, claim_stage
 from storage.db import Database
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
 from storage.jobs import delete_job, open_for_retry, request_cancel, retry_job, stage_id
-from storage.keys import job_prefix
 from storage.leases import (
     cancel_stage,
     crash_stage,
@@ -44,7 +43,7 @@ from storage.queue import RESOURCES
 from storage.records import append_logs
 from storage.runs import RunEnd
 from storage.states import JOB_TERMINAL
-from tests.factories import DIAMOND, LINE, empty, make_database, make_job
+from tests.factories import DIAMOND, LINE, empty, make_database, make_job, root_of
 from tests.histories import check_can_go_on, check_history
 
 T0 = datetime(2026, 1, 1, tzinfo=UTC)
@@ -182,7 +181,7 @@ class AtOnce(RuleBasedStateMachine):
             for record in (StageRow, StageRun, Event, LogLine):
                 assert set(session.scalars(select(record.job_id))) <= there
             notes = set(session.scalars(select(PendingDeletion.prefix)))
-            assert {job_prefix(job) for job in self.deleted} <= notes
+            assert {root_of(job) for job in self.deleted} <= notes
             runs = select(StageRun.job_id, StageRun.stage, StageRun.token, StageRun.owner)
             owners = {
                 (job, stage, token): owner for job, stage, token, owner in session.execute(runs)
