@@ -1,7 +1,8 @@
 """What the storage room refuses or cannot do.
 
 The API turns `NotFoundError` into 404, `ConflictError` into 409 and `InvalidCursorError` into 422;
-the worker turns the object store's errors into retryable failures of a stage.
+the worker turns the object store's errors into retryable failures of a stage, or gives the stage
+back where the store is away.
 """
 
 from __future__ import annotations

@@ -263,18 +263,28 @@ def crash_stage(
     return _lose(session, job, stages, row, run, when or now(session), report)
 
 
-def release_stage(session: Session, claim: Claim, when: datetime | None = None) -> str:
-    """Give a stage back unharmed (the worker shuts down): the attempt does not count."""
+def release_stage(
+    session: Session,
+    claim: Claim,
+    when: datetime | None = None,
+    *,
+    error: dict[str, Any] | None = None,
+) -> str:
+    """Give a stage back unharmed: the attempt does not count.
+
+    error: what the worker lacks; without one it shuts down.
+    """
     job, stages, row, earlier = _held(session, claim, "released")
     if earlier is not None:
         return str(earlier.led_to)
-    when, run = when or now(session), RunEnd("released")
+    when, run = when or now(session), RunEnd("released", error)
     if job.state != "running":
         set_stage(session, row, "cancelled", when, run=run, reason=f"job_{job.state}")
         settle(session, job, stages, when)
         return "cancelled"
     attempt = row.attempt - 1
-    set_stage(session, row, "ready", when, run=run, reason="shutdown", attempt=attempt)
+    reason = str(error["code"]) if error else "shutdown"
+    set_stage(session, row, "ready", when, run=run, reason=reason, attempt=attempt)
     return "ready"
 
 

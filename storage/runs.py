@@ -26,7 +26,7 @@ OUTCOMES = (
     "stalled",  # alive, but without progress for too long
     "time_limit",
     "lost",  # its worker stopped without a word, or started anew
-    "released",  # its worker shut down in order
+    "released",  # its worker shut down in order, or found the object store away
     "cancelled",
 )
 

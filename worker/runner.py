@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError, TimeoutError
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from pipelines.stage import Stage
@@ -41,6 +41,7 @@ from storage.steps import reached
 from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.disk import free_bytes
 from worker.failures import publish_failure
+from worker.laps import Laps
 from worker.outcomes import (
     StageCrashedError,
     StageFailedError,
@@ -50,6 +51,7 @@ from worker.outcomes import (
     disk_too_small,
     failure_of,
     gave_up_of,
+    is_away,
     stalled_of,
     time_limit_of,
 )
@@ -57,6 +59,7 @@ from worker.predecessors import end_predecessor
 from worker.process import StageProcess
 from worker.progress import LeaseKeeper
 from worker.settings import WorkerSettings
+from worker.store_watch import StoreWatch
 from worker.transfer import (
     fetch_capture,
     fetch_inputs,
@@ -87,24 +90,6 @@ def load_registry(name: str) -> Registry:
     """The registry module of that dotted name. Reading it imports no stage's code."""
     module: Registry = importlib.import_module(name)
     return module
-
-
-class Laps:
-    """Seconds of the parts of an attempt, one after the other. They end in the row's manifest.
-
-    fetch_s: bring the inputs. start_s: until the stage process has begun. run_s: the stage there,
-    with hashing and publishing its folder. store_s: bring the results to the object store.
-    """
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._ended = time.monotonic()
-
-    def end(self, name: str) -> None:
-        """The part that ran since the last call, or since the start, was this one."""
-        moment = time.monotonic()
-        self.seconds[name] = round(moment - self._ended, 3)
-        self._ended = moment
 
 
 class Pulse:
@@ -149,7 +134,8 @@ class Runner:
 
     registry: dotted name of the stages' registry. threads: says how many the numeric libraries of a
     stage that starts now may use, where the environment's OMP_NUM_THREADS does not.
-    shutdown: set when the worker ends; a running attempt then gives its stage back.
+    shutdown: set when the worker ends; a running attempt then gives its stage back. store_watch:
+    the worker's; an attempt that it explains does so, too.
     """
 
     def __init__(
@@ -162,6 +148,7 @@ class Runner:
         registry: str,
         threads: Callable[[], int],
         shutdown: threading.Event,
+        store_watch: StoreWatch | None = None,
     ) -> None:
         self._database = database
         self._store = store
@@ -171,6 +158,7 @@ class Runner:
         self._registry = load_registry(registry)
         self._threads = threads
         self._shutdown = shutdown
+        self._store_watch = store_watch or StoreWatch(store)
         self._preload: Sequence[str] = ()
         self._process: StageProcess | None = None
         self._peak_bytes: int | None = None  # of the run at hand
@@ -431,6 +419,10 @@ class Runner:
             if error.reason == "shutdown":
                 return lambda session: release_stage(session, claim)
             return lambda session: cancel_stage(session, claim)
+        if self._store_watch.explains(error):
+            _log.warning("%s: given back, the object store is away: %s", claim.stage_id, error)
+            away = failure_of(claim.name, error)
+            return lambda session: release_stage(session, claim, error=away)
         if isinstance(error, StageCrashedError):
             crash = error
             _log.warning("%s: %s", claim.stage_id, crash.error["message"])
@@ -471,7 +463,7 @@ class Runner:
                     return operation(session)
             except SQLAlchemyError as error:
                 _log.warning("the end of a stage waits for the database: %s", error)
-                given_up = not _is_away(error) and time.monotonic() > deadline
+                given_up = not is_away(error) and time.monotonic() > deadline
                 if given_up or self._shutdown.wait(RECORD_STEP_S):
                     raise UnknownOutcomeError from error
 
@@ -488,11 +480,6 @@ class Runner:
                     self._store.delete(key)
         except StorageError as error:
             _log.warning("left behind below %s: %s", prefix, error)
-
-
-def _is_away(error: SQLAlchemyError) -> bool:
-    """Whether the database cannot be reached, or has no time: it may answer later."""
-    return isinstance(error, OperationalError | InterfaceError | TimeoutError)
 
 
 def _raise(error: Exception) -> None:

@@ -43,6 +43,7 @@ from worker.housekeeping import Housekeeping
 from worker.locks import is_process
 from worker.runner import Runner, load_registry
 from worker.settings import WorkerSettings
+from worker.store_watch import StoreWatch
 
 _log = logging.getLogger("nerfworks.worker")
 
@@ -122,6 +123,7 @@ class WorkerRuntime:
         self._stages = load_registry(registry).STAGES
         self._compiler = KernelCompiler()
         self._disk = DiskWatch(storage.work_dir, settings.min_free_bytes)
+        self._store_watch = StoreWatch(self._store)
         self._runners = [
             Runner(
                 self._database,
@@ -131,6 +133,7 @@ class WorkerRuntime:
                 registry=registry,
                 threads=self._threads_now,
                 shutdown=self.shutdown,
+                store_watch=self._store_watch,
             )
             for _ in range(identity.slots)
         ]
@@ -258,7 +261,7 @@ class WorkerRuntime:
 
         A worker with a GPU takes what needs one first, a slot beside one that has it the rest.
         """
-        if self.shutdown.is_set() or not self._disk.has_room():
+        if self.shutdown.is_set() or not (self._disk.has_room() and self._store_watch.answers()):
             return None
         has_gpu = self.identity.has_gpu and self._gpu.acquire(blocking=False)
         claim: Claim | None = None
@@ -295,6 +298,8 @@ class WorkerRuntime:
     def _offer(self) -> None:
         if self._free.empty() or self.shutdown.is_set() or not self._disk.has_room():
             return
+        if self._store_watch.is_pausing:
+            return  # whoever takes a stage then asks the store: this thread waits for nothing
         with self._database.read_scope() as session:
             served = self._served(session)
             if self._gpu.locked():

@@ -9,7 +9,7 @@ it several times over HTTP. The first job finds nothing warm; the others find th
 its libraries and kernels loaded. The clock of the client and of the service is one.
 
 Where the seconds go: the rows of the stages say when each became ready, was claimed and was
-recorded as done, the timings in their manifests (`worker.runner.Laps`, `pipelines.manifest`) the
+recorded as done, the timings in their manifests (`worker.laps.Laps`, `pipelines.manifest`) the
 rest. The parts of a job sum to its wall time, if no two of its stages ran at once.
 """
 
