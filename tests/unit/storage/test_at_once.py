@@ -26,6 +26,7 @@ from sqlalchemy.orm import Session
 from storage.claims import Claim, claim_next, claim_stage
 from storage.db import Database
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
+from storage.exports import create_export, open_for_export
 from storage.jobs import delete_job, open_for_retry, request_cancel, retry_job, stage_id
 from storage.leases import (
     cancel_stage,
@@ -38,11 +39,20 @@ from storage.leases import (
     save_checkpoint,
     succeed_stage,
 )
-from storage.models import Event, Job, LogLine, PendingDeletion, StageRow, StageRun
+from storage.models import (
+    Event,
+    Job,
+    JobGeneration,
+    LogLine,
+    PendingDeletion,
+    StageRow,
+    StageRun,
+)
 from storage.queue import RESOURCES
 from storage.records import append_logs
 from storage.runs import RunEnd
 from storage.states import JOB_TERMINAL
+from storage.transitions import lock_job
 from tests.factories import DIAMOND, LINE, empty, make_database, make_job, root_of
 from tests.histories import check_can_go_on, check_history
 
@@ -56,7 +66,7 @@ Deed = tuple[str, int, int]
 """What is done, and which of the claims or jobs, newest first, and which worker or stage."""
 
 WORK = ("take", "take", "want", "succeed", "succeed", "retry", "crash", "release", "beat", "save")
-PEOPLE = ("submit", "cancel", "again", "delete")
+PEOPLE = ("submit", "cancel", "again", "export", "export", "delete")
 deeds = st.tuples(
     st.sampled_from([*WORK, *WORK, *PEOPLE, "fail", "stop", "reap", "restart", "log"]),
     st.integers(0, 3),
@@ -125,10 +135,10 @@ class AtOnce(RuleBasedStateMachine):
             others = [(one.stage_id, one.token) for one in self.claims]
             assert (result.stage_id, result.token) not in others, "two holders of one claim"
             self.claims.append(result)
-        elif what == "submit":
+        elif what in ("submit", "export") and result is not None:
             self.jobs.append(result)
         elif what == "delete" and result is not None:
-            self.deleted.add(result)
+            self.deleted |= result
 
     def do(self, deed: Deed, begin: Callable[[], object]) -> Any:
         """One deed in a transaction of its own; None where it was refused, or there is nothing."""
@@ -162,8 +172,15 @@ class AtOnce(RuleBasedStateMachine):
         if what == "cancel":
             return request_cancel(session, job, when=self.when).id
         if what == "delete":
+            lock_job(session, job)
+            exports = session.scalars(select(Job.id).where(Job.parent_id == job)).all()
             delete_job(session, job, when=self.when)
-            return job
+            return {job, *exports}
+        if what == "export":
+            parent = open_for_export(session, job)
+            if parent.parent_id is not None:
+                return None  # the API refuses exports of exports
+            return create_export(session, parent, "first", {}, when=self.when).id
         assert what == "again"
         found = open_for_retry(session, job)
         redo = {row.name for row in found.stages}
@@ -178,7 +195,7 @@ class AtOnce(RuleBasedStateMachine):
             for job in there:
                 check_history(session, job)
                 check_can_go_on(session, job)
-            for record in (StageRow, StageRun, Event, LogLine):
+            for record in (StageRow, StageRun, JobGeneration, Event, LogLine):
                 assert set(session.scalars(select(record.job_id))) <= there
             notes = set(session.scalars(select(PendingDeletion.prefix)))
             assert {root_of(job) for job in self.deleted} <= notes
