@@ -5,7 +5,7 @@ Product code says `reached(name)` at each of them; that does nothing unless a te
 transaction two are said by `storage.db.Database.session_scope`: `.commit` when all is done but the
 COMMIT, `.committed` after it, before anybody was told. While files go to the object store three
 are: `.bytes` within one file, `.put` after each, `.stored` after the last, before any record names
-them. `tests/integration/test_steps_*.py` kill a process at every one, and lose the answer of every
+them. `tests/integration/test_steps*.py` kill a process at every one, and lose the answer of every
 COMMIT.
 """
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -13,9 +14,12 @@ from sqlalchemy.exc import OperationalError
 from storage.steps import names, watch
 
 
-def kill_at(step: str, nth: int = 1) -> Callable[[str], None]:
-    """A watcher that kills this process, as `kill -9` does, when a step is reached so often."""
-    return _nth(step, nth, lambda: os.kill(os.getpid(), signal.SIGKILL))
+def kill_at(step: str, nth: int = 1, claims: int = 0) -> Callable[[str], None]:
+    """A watcher that kills this process, as `kill -9` does, when a step is reached so often.
+
+    claims: what comes before the claim of that number does not count.
+    """
+    return _nth(step, nth, lambda: os.kill(os.getpid(), signal.SIGKILL), claims)
 
 
 def lose_answer() -> None:
@@ -23,17 +27,17 @@ def lose_answer() -> None:
     raise OperationalError("COMMIT", {}, Exception("the connection is gone"))
 
 
-def _nth(step: str, nth: int, act: Callable[[], object]) -> Callable[[str], None]:
+def _nth(step: str, nth: int, act: Callable[[], object], claims: int = 0) -> Callable[[str], None]:
     if step not in names():
         raise ValueError(f"no step {step}")
-    lock, left = threading.Lock(), [nth]
+    lock = threading.Lock()
+    seen: Counter[str] = Counter()
 
     def watcher(name: str) -> None:
-        if name != step:
-            return
         with lock:
-            left[0] -= 1
-            due = left[0] == 0
+            seen["claims"] += name == "claim.commit"
+            seen["due"] += name == step and seen["claims"] >= claims
+            due = name == step and seen["claims"] >= claims and seen["due"] == nth
         if due:
             act()
 
@@ -42,9 +46,11 @@ def _nth(step: str, nth: int, act: Callable[[], object]) -> Callable[[str], None
 
 @contextmanager
 def at_step(
-    step: str, act: Callable[[], object] = lose_answer, nth: int = 1
+    step: str, act: Callable[[], object] = lose_answer, nth: int = 1, claims: int = 0
 ) -> Iterator[threading.Event]:
     """While the block runs, something happens when this process reaches a step so often.
+
+    claims: as of `kill_at`.
 
     act: by default the answer to the COMMIT is lost: at `.commit` it has not happened, at
     `.committed` it has. The event tells whether it came to that.
@@ -55,7 +61,7 @@ def at_step(
         happened.set()
         act()
 
-    watch(_nth(step, nth, doing))
+    watch(_nth(step, nth, doing, claims))
     try:
         yield happened
     finally:

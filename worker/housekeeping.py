@@ -144,7 +144,8 @@ class Housekeeping:
         self._stopped.set()
         give_up_at = time.monotonic() + timeout_s
         for thread in self._threads:
-            thread.join(max(give_up_at - time.monotonic(), 0.0))
+            if thread.is_alive():
+                thread.join(max(give_up_at - time.monotonic(), 0.0))
 
     def _loop(self, duties: tuple[Callable[[], None], ...], pause_s: float) -> None:
         while not self._stopped.is_set():

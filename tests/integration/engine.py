@@ -60,6 +60,7 @@ class Engine:
         self.bell = Bell(redis_url, self.database)
         self.witness = folder / "witness.txt"
         self.witness.touch()
+        (folder / "worker.log").touch()
         self.workers: list[subprocess.Popen[bytes]] = []
 
     def start_worker(self, worker_id: str = "w1", *more: str) -> subprocess.Popen[bytes]:
