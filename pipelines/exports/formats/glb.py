@@ -28,7 +28,9 @@ from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 Floats = NDArray[np.float64]
 
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
-_FLOAT, _UINT32, _UINT16 = 5126, 5125, 5123
+_FLOAT, _UINT32, _UINT16, _INT8 = 5126, 5125, 5123, 5120
+_STEPS = 65535.0
+_QUANTIZATION = "KHR_mesh_quantization"
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
 _JPEG_QUALITY = 92
@@ -54,13 +56,27 @@ def linear_from_srgb(color: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Accessor:
-    """One array of the file. name: of the attribute, "" for indices."""
+    """One array of the file. name: of the attribute, "" for indices. padded: whether its rows end
+    in one value that fills them up to 4 bytes and does not count."""
 
     name: str
     values: NDArray[Any]
     kind: str
     component: int
     normalized: bool = False
+    padded: bool = False
+
+    def view(self, offset: int) -> dict[str, Any]:
+        """Its buffer view."""
+        plain: dict[str, Any] = {
+            "buffer": 0,
+            "byteOffset": offset,
+            "byteLength": self.values.nbytes,
+            "target": _ARRAY_BUFFER if self.name else _ELEMENT_ARRAY_BUFFER,
+        }
+        if self.padded:
+            plain["byteStride"] = self.values.strides[0]
+        return plain
 
     def as_dict(self, view: int) -> dict[str, Any]:
         """The accessor of the buffer view of the same number."""
@@ -73,8 +89,9 @@ class _Accessor:
         if self.normalized:
             plain["normalized"] = True
         if self.name == "POSITION":
-            plain["min"] = [float(value) for value in self.values.min(axis=0)]
-            plain["max"] = [float(value) for value in self.values.max(axis=0)]
+            counted = self.values[:, :3]
+            plain["min"] = [number.item() for number in counted.min(axis=0)]
+            plain["max"] = [number.item() for number in counted.max(axis=0)]
         return plain
 
 
@@ -86,7 +103,23 @@ def srgb_from_linear(linear: Floats) -> Floats:
     return color
 
 
-def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, metric: bool = False) -> None:
+@dataclass(frozen=True)
+class GlbStyle:
+    """unlit: colours as they are, which hold the light of the capture; else a rough surface that
+    the viewer's lamps light. quantized: places in 65535 steps of the longest side and half the
+    bytes a vertex (`KHR_mesh_quantization`), for viewers that know it.
+    """
+
+    unlit: bool = True
+    quantized: bool = False
+
+
+def write_mesh(
+    path: Path,
+    mesh: TriangleMesh | TexturedMesh,
+    metric: bool = False,
+    style: GlbStyle = GlbStyle(),
+) -> None:
     """Write a mesh of our world, +Z up; its normals may have any length.
 
     metric: whether a unit is a metre, as glTF would have it; `asset.extras.frame` says which.
@@ -100,17 +133,29 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, metric: bool = Fal
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("a face names a vertex that does not exist")
     frame = Frame("y", metric)
-    unit = unit_normals(normals)
+    places, directions = frame.of_world(vertices), frame.of_world(unit_normals(normals))
+    node: dict[str, Any] = {"mesh": 0, "name": "scene"}
+    if style.quantized:
+        low, size = places.min(axis=0), max(float(np.ptp(places, axis=0).max()), 1e-12)
+        node |= {"translation": low.tolist(), "scale": [size] * 3}
+        shape = [
+            _steps("POSITION", np.rint((places - low) * (_STEPS / size)), "<u2", _UINT16),
+            _steps("NORMAL", np.rint(127.0 * directions), "<i1", _INT8),
+        ]
+    else:
+        shape = [
+            _Accessor("POSITION", places.astype("<f4"), "VEC3", _FLOAT),
+            _Accessor("NORMAL", directions.astype("<f4"), "VEC3", _FLOAT),
+        ]
     accessors = [
-        _Accessor("POSITION", frame.of_world(vertices).astype("<f4"), "VEC3", _FLOAT),
-        _Accessor("NORMAL", frame.of_world(unit).astype("<f4"), "VEC3", _FLOAT),
-        _colored(mesh),
+        *shape,
+        _colored(mesh, style.quantized),
         _Accessor("", faces.astype("<u4"), "SCALAR", _UINT32),
     ]
     picture = jpeg(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
     # Arrays are multiples of 4 bytes by their types; the picture comes last and is padded.
     blobs = [accessor.values.tobytes() for accessor in accessors] + [picture] * bool(picture)
-    document = _document(accessors, [len(blob) for blob in blobs], bool(picture), frame.note())
+    document = _document(accessors, len(picture), frame.note(), node, style)
     text = json.dumps(document, separators=(",", ":")).encode("utf-8")
     text += b" " * (-len(text) % 4)
     binary = b"".join(blobs)
@@ -135,20 +180,42 @@ def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
         ]
         (primitive,) = document["meshes"][0]["primitives"]
         at = primitive["attributes"]
-        position, normal = (
-            frame.to_world(np.frombuffer(views[at[name]], "<f4").reshape(-1, 3).astype(np.float64))
-            for name in ("POSITION", "NORMAL")
+        kinds = [accessor["componentType"] for accessor in document["accessors"]]
+        placed, turned = (
+            _three(views[at[name]], kinds[at[name]]) for name in ("POSITION", "NORMAL")
         )
+        (node,) = document["nodes"]
+        placed = placed * node.get("scale", 1.0) + node.get("translation", 0.0)
+        position, normal = frame.to_world(placed), frame.to_world(unit_normals(turned))
         faces = np.frombuffer(views[primitive["indices"]], "<u4").reshape(-1, 3).astype(np.int32)
         if "images" not in document:
             rgba = np.frombuffer(views[at["COLOR_0"]], "<u2").reshape(-1, 4)
             return TriangleMesh(position, faces, srgb_from_linear(rgba[:, :3] / 65535.0), normal)
-        uv = np.frombuffer(views[at["TEXCOORD_0"]], "<f4").reshape(-1, 2).astype(np.float64)
+        in_steps = kinds[at["TEXCOORD_0"]] == _UINT16
+        flat = np.frombuffer(views[at["TEXCOORD_0"]], "<u2" if in_steps else "<f4")
+        uv = flat.reshape(-1, 2).astype(np.float64) / (_STEPS if in_steps else 1.0)
         with Image.open(io.BytesIO(views[document["images"][0]["bufferView"]])) as opened:
             texture = np.asarray(opened.convert("RGB"))
     except (KeyError, IndexError, TypeError, OSError, ValueError) as error:
         raise ValueError(f"{path.name} is no mesh of ours: {error}") from error
     return TexturedMesh(position, faces, normal, uv, texture)
+
+
+def _steps(name: str, values: Floats, kind: str, component: int) -> _Accessor:
+    """Whole numbers [V, 3] as an array with a fourth one, so that rows are multiples of 4 bytes."""
+    padded = np.zeros((len(values), 4), kind)
+    padded[:, :3] = values
+    return _Accessor(name, padded, "VEC3", component, normalized=True, padded=True)
+
+
+def _three(view: memoryview, component: int) -> Floats:
+    """[V, 3] of what `write_mesh` wrote in a buffer view, as glTF decodes it."""
+    if component == _FLOAT:
+        return np.frombuffer(view, "<f4").reshape(-1, 3).astype(np.float64)
+    kind, most = ("<u2", _STEPS) if component == _UINT16 else ("<i1", 127.0)
+    padded = np.frombuffer(view, kind).reshape(-1, 4)
+    values: Floats = np.maximum(padded[:, :3] / most, -1.0)
+    return values
 
 
 def _parts(path: Path) -> tuple[dict[str, Any], memoryview]:
@@ -164,12 +231,15 @@ def _parts(path: Path) -> tuple[dict[str, Any], memoryview]:
     return document, memoryview(data)[28 + length :]
 
 
-def _colored(mesh: TriangleMesh | TexturedMesh) -> _Accessor:
+def _colored(mesh: TriangleMesh | TexturedMesh, quantized: bool) -> _Accessor:
     """What gives a vertex its colour."""
     count = len(mesh.vertices)
     if isinstance(mesh, TexturedMesh):
         if mesh.uv.shape != (count, 2):
             raise ValueError(f"uv {mesh.uv.shape} must be ({count}, 2)")
+        if quantized:
+            steps = np.rint(_STEPS * np.clip(mesh.uv, 0.0, 1.0)).astype("<u2")
+            return _Accessor("TEXCOORD_0", steps, "VEC2", _UINT16, normalized=True)
         return _Accessor("TEXCOORD_0", mesh.uv.astype("<f4"), "VEC2", _FLOAT)
     if mesh.colors.shape != mesh.vertices.shape:
         raise ValueError(f"colors {mesh.colors.shape} must be like {mesh.vertices.shape}")
@@ -186,24 +256,29 @@ def jpeg(texture: NDArray[np.uint8]) -> bytes:
 
 
 def _document(
-    accessors: list[_Accessor], sizes: list[int], has_picture: bool, note: str
+    accessors: list[_Accessor], picture_bytes: int, note: str, node: dict[str, Any], style: GlbStyle
 ) -> dict[str, Any]:
-    """The JSON part. sizes: bytes of each accessor, then of the picture where there is one."""
-    offsets = [sum(sizes[:i]) for i in range(len(sizes))]
-    views: list[dict[str, Any]] = [
-        {"buffer": 0, "byteOffset": offset, "byteLength": size}
-        for offset, size in zip(offsets, sizes, strict=True)
-    ]
-    for view, accessor in zip(views, accessors, strict=False):
-        view["target"] = _ARRAY_BUFFER if accessor.name else _ELEMENT_ARRAY_BUFFER
+    """The JSON part. picture_bytes: of the texture behind all arrays, 0 for none."""
+    views: list[dict[str, Any]] = []
+    total = 0
+    for accessor in accessors:
+        views.append(accessor.view(total))
+        total += accessor.values.nbytes
+    if picture_bytes:
+        views.append({"buffer": 0, "byteOffset": total, "byteLength": picture_bytes})
+        total += picture_bytes
     names = [accessor.name for accessor in accessors]
-    material = _MATERIAL
+    material = {
+        key: value for key, value in _MATERIAL.items() if style.unlit or key != "extensions"
+    }
+    used = ["KHR_materials_unlit"] * style.unlit + [_QUANTIZATION] * style.quantized
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "nerfworks", "extras": {"frame": note}},
-        "extensionsUsed": ["KHR_materials_unlit"],
+        **({"extensionsUsed": used} if used else {}),
+        **({"extensionsRequired": [_QUANTIZATION]} if style.quantized else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "scene"}],
+        "nodes": [node],
         "meshes": [
             {
                 "primitives": [
@@ -218,11 +293,11 @@ def _document(
         ],
         "accessors": [accessor.as_dict(view) for view, accessor in enumerate(accessors)],
         "bufferViews": views,
-        "buffers": [{"byteLength": sum(sizes) + -sum(sizes) % 4}],
+        "buffers": [{"byteLength": total + -total % 4}],
     }
-    if has_picture:
+    if picture_bytes:
         base = {**_MATERIAL["pbrMetallicRoughness"], "baseColorTexture": {"index": 0}}
-        material = {**_MATERIAL, "pbrMetallicRoughness": base}
+        material["pbrMetallicRoughness"] = base
         wraps = {"wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}
         document["images"] = [{"bufferView": len(accessors), "mimeType": "image/jpeg"}]
         document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR, **wraps}]

@@ -21,6 +21,7 @@ from pipelines.exports.options import CropOptions, TextureOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
+    from pipelines.exports.formats.glb import GlbStyle
     from pipelines.exports.mesh import TexturedMesh, TriangleMesh
     from pipelines.scene.trained_scene import TrainedScene
 
@@ -81,6 +82,18 @@ class MeshOptions(CropOptions, TextureOptions):
         description="Levels of detail beside mesh.glb: mesh-lod1.glb has a quarter of its "
         "triangles, mesh-lod2.glb a sixteenth, mesh-lod3.glb a sixty-fourth, each with a texture "
         "of half the side.",
+    )
+
+    glb_unlit: bool = Field(
+        True,
+        description="glb shows the captured colours as they are, light and all; off, the viewer's "
+        "lamps light them once more.",
+    )
+    glb_quantized: bool = Field(
+        False,
+        description="glb with places in 65535 steps of the longest side and half the bytes a "
+        "vertex (KHR_mesh_quantization), for three.js and the like; other programs may not know "
+        "it.",
     )
 
     @field_validator("formats")
@@ -160,7 +173,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     levels = []
     for level, shape in enumerate(levels_of(mesh, options.lods), start=1):
         coarse, path = paint(shape, level), ctx.out / f"mesh-lod{level}.glb"
-        glb.write_mesh(path, coarse, scene.cameras.metric)
+        glb.write_mesh(path, coarse, scene.cameras.metric, style_of(options))
         levels.append({"file": path.name, **_told(coarse)})
     ctx.progress(_TEXTURE_SHARE, "writing")
     _write(mesh, skin, options, ctx, scene.cameras.metric)
@@ -176,6 +189,13 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             {"voxel": round(shell.voxel, 9), **shell.bounds.as_dict()} for shell in shells[1:]
         ],
     }
+
+
+def style_of(options: MeshOptions) -> GlbStyle:
+    """How GLB files are written."""
+    from pipelines.exports.formats.glb import GlbStyle
+
+    return GlbStyle(options.glb_unlit, options.glb_quantized)
 
 
 def _told(skin: TriangleMesh | TexturedMesh) -> dict[str, Any]:
@@ -200,7 +220,7 @@ def _write(
 
     frame = Frame(options.up_axis, metric)
     writers: dict[Format, Callable[[Path], None]] = {
-        "glb": lambda path: glb.write_mesh(path, skin, metric),
+        "glb": lambda path: glb.write_mesh(path, skin, metric, style_of(options)),
         "ply": lambda path: ply.write_mesh(path, mesh, frame),
         "obj": lambda path: obj.write_mesh(path, skin, frame),
         "stl": lambda path: stl.write_mesh(path, mesh, frame),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import struct
 from pathlib import Path
@@ -12,6 +13,7 @@ import open3d
 import pytest
 
 from pipelines.exports.formats.glb import (
+    GlbStyle,
     linear_from_srgb,
     read_mesh,
     write_mesh,
@@ -197,3 +199,38 @@ def test_the_khronos_validator_finds_planted_faults(tmp_path: Path) -> None:
     found = " ".join(problems_of(path))
     assert "ACCESSOR_VECTOR3_NON_UNIT" in found
     assert "ACCESSOR_INDEX_OOB" in found
+
+
+@pytest.mark.parametrize("kind", ["file", "textured"])
+def test_quantized_files_show_the_same_in_half_the_bytes_a_vertex(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    plain = read_mesh(request.getfixturevalue(kind))
+    path = tmp_path / "quantized.glb"
+    far = dataclasses.replace(plain, vertices=plain.vertices + np.array([4000.0, -900.0, 20.0]))
+    write_mesh(path, far, style=GlbStyle(quantized=True))
+    assert problems_of(path) == []
+    found = read_mesh(path)
+    assert type(found) is type(plain)
+    assert np.abs(found.vertices - far.vertices).max() <= 5.0 / 65535.0
+    np.testing.assert_array_equal(found.faces, plain.faces)
+    unit = plain.normals / np.linalg.norm(plain.normals, axis=1, keepdims=True)
+    assert (found.normals * unit).sum(axis=1).min() > 0.999
+    if isinstance(found, TexturedMesh) and isinstance(plain, TexturedMesh):
+        assert np.abs(found.uv - plain.uv).max() <= 1.0 / 65535.0
+    data = path.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert document["extensionsRequired"] == ["KHR_mesh_quantization"]
+    widths = [view.get("byteStride") for view in document["bufferViews"]]
+    assert widths[:2] == [8, 4]
+
+
+@pytest.mark.parametrize("kind", ["file", "textured"])
+def test_a_lit_file_leaves_light_to_the_viewer(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    path = tmp_path / "lit.glb"
+    write_mesh(path, read_mesh(request.getfixturevalue(kind)), style=GlbStyle(unlit=False))
+    assert problems_of(path) == []
+    assert b"KHR_materials_unlit" not in path.read_bytes()
+    assert b"roughnessFactor" in path.read_bytes()
