@@ -21,7 +21,7 @@ def _export_stage(export: Export) -> Stage:
     return Stage(
         name=export.kind,
         version=export.version,
-        after=("train",),
+        after=("train", *(kind for kind in export.reads if kind in KINDS)),
         reads=(*export.reads, "train"),
         run="pipelines.stages.export:run",
         options=export.options.__name__,

@@ -16,6 +16,7 @@ KINDS = (
     "cameras",
     "dataset",
     "views",
+    "meshvideo",
 )
 """In the order in which they are listed and, where nothing runs side by side, made."""
 

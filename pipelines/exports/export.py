@@ -30,7 +30,8 @@ class Export:
     run: see `ExportFunction`. options: their class; `RenderingOptions` where it renders.
     artifacts: what it writes; one that a scene has no use for may be missing.
     on_request: whether jobs skip it unless they have options for it.
-    reads: stages whose folders it reads besides that of `train`.
+    reads: stages whose folders it reads besides that of `train`: of what lies before training, or
+        other exports, for which it waits.
     needs_gpu, time_limit_s: as in `pipelines.stage.Stage`.
     """
 

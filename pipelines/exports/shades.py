@@ -60,14 +60,18 @@ def normals_of(view: DepthView) -> NDArray[np.float32]:
 
     From the points of neighbouring pixels; unknown beside a jump in depth and at the picture's rim.
     """
-    known = view.smooth_mask()
     points = view.lens.directions() * np.asarray(view.z_depth, np.float64)[..., None]
+    return normals_of_points(points, view.smooth_mask())
+
+
+def normals_of_points(points: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The same of any lens. points: [H, W, 3], camera axes. known: [H, W], surface without jump."""
     normals = np.zeros((*known.shape, 3), np.float32)
     if min(known.shape) < 3:
         return normals
+    # Down crossed with right looks back at the camera.
     right = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
-    # Camera axes: x right, y up. Down crossed with right looks back at the camera.
     crossed = np.cross(down, right)
     length = np.linalg.norm(crossed, axis=-1, keepdims=True)
     whole = known[1:-1, 1:-1] & known[1:-1, 2:] & known[1:-1, :-2] & known[2:, 1:-1]

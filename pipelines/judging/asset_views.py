@@ -8,6 +8,7 @@ vertices, F faces, P points, H x W pixels.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.nerf.space.cameras import Cameras
+from pipelines.nerf.space.lenses import EQUIRECTANGULAR
 from pipelines.scene.picture_sampling import between_pixels, points_in_frame
 
 Floats = NDArray[np.floating[Any]]
@@ -147,6 +149,8 @@ class MeshCaster:
         """Some rows of what camera `index` sees."""
         width = int(cameras.size[index, 0])
         angle = 1.0 / (samples * float(cameras.focal[index].mean()))
+        if int(cameras.model[index]) == EQUIRECTANGULAR:
+            angle *= math.pi  # its plane is in half turns, not in radians
         shape = (len(rows) * samples, width * samples)
         x, y = (
             (torch.arange(length, dtype=cameras.focal.dtype) + 0.5) / samples

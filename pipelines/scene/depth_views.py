@@ -107,18 +107,21 @@ class DepthView:
         before stays, or the edges of things would be eaten away. A jump is a step steeper than a
         surface seen at 84 degrees, and at least 2 % of the depth.
         """
-        z = self.z_depth
-        limit = max(_SMALLEST_JUMP, _STEEPEST_SLOPE / min(self.lens.fl_x, self.lens.fl_y))
-        known = z > 0
-        good = known.copy()
-        for axis in (0, 1):
-            near, far = [slice(None)] * 2, [slice(None)] * 2
-            near[axis], far[axis] = slice(None, -1), slice(1, None)
-            a, b = z[tuple(near)], z[tuple(far)]
-            jump = np.abs(a - b) > limit * np.minimum(a, b)
-            good[tuple(near)] &= ~jump | (a < b)
-            good[tuple(far)] &= ~jump | (b < a)
-        return good
+        return without_jumps(self.z_depth, 1.0 / min(self.lens.fl_x, self.lens.fl_y))
+
+
+def without_jumps(depth: NDArray[np.floating], angle: float) -> Bools:
+    """`DepthView.smooth_mask` of any depth [H, W]. angle: between neighbouring pixels, radians."""
+    limit = max(_SMALLEST_JUMP, _STEEPEST_SLOPE * angle)
+    good = depth > 0
+    for axis in (0, 1):
+        near, far = [slice(None)] * 2, [slice(None)] * 2
+        near[axis], far[axis] = slice(None, -1), slice(1, None)
+        a, b = depth[tuple(near)], depth[tuple(far)]
+        jump = np.abs(a - b) > limit * np.minimum(a, b)
+        good[tuple(near)] &= ~jump | (a < b)
+        good[tuple(far)] &= ~jump | (b < a)
+    return good
 
 
 def z_depth_of(
@@ -127,18 +130,31 @@ def z_depth_of(
     expected: NDArray[np.floating],
     accumulation: NDArray[np.floating],
 ) -> NDArray[np.float32]:
-    """Z-depth of the surface from distances along the rays.
+    """Z-depth of the surface from distances along the rays, as of `surface_distance`."""
+    distance = surface_distance(median, expected, accumulation)
+    z: NDArray[np.float32] = (distance / np.linalg.norm(lens.directions(), axis=-1)).astype(
+        np.float32
+    )
+    return z
+
+
+def surface_distance(
+    median: NDArray[np.floating],
+    expected: NDArray[np.floating],
+    accumulation: NDArray[np.floating],
+) -> Floats:
+    """How far along each ray the surface is.
 
     median, expected: [H, W] distances in world units; accumulation: [H, W] in [0, 1]. The expected
     distance is smooth but is pulled away where a ray meets two surfaces; the median is steady but
     quantised by the samples. So: the expected one where both agree within 5 %, else the median.
-    Returns [H, W] float32, 0 where the ray met no surface.
+    Returns [H, W], 0 where the ray met no surface.
     """
     agree = np.abs(expected - median) <= _MEDIAN_TRUST * median
     distance = np.where(agree, expected, median)
-    z = distance / np.linalg.norm(lens.directions(), axis=-1)
-    known = (accumulation >= MIN_ACCUMULATION) & np.isfinite(z) & (z > 0)
-    return np.where(known, z, 0.0).astype(np.float32)
+    known = (accumulation >= MIN_ACCUMULATION) & np.isfinite(distance) & (distance > 0)
+    found: Floats = np.where(known, distance, 0.0)
+    return found
 
 
 class ViewStore:

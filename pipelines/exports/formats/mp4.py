@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ToolError
+from pipelines.exports.formats.spherical import mark_equirectangular
 from pipelines.tools.ffmpeg import compile_command
 from pipelines.tools.process import Program
 
@@ -40,17 +41,26 @@ _CODECS: dict[str, dict[str, str]] = {
 class VideoWriter:
     """A context manager: `write` each frame; leaving the block normally finishes the file.
 
+    equirectangular: whether the file says that its picture is a whole sphere.
     Leaving it by an exception (a cancel too) ends ffmpeg and removes the file. Raises ToolError
     where ffmpeg fails, with its last lines in `details["log"]`.
     """
 
     def __init__(
-        self, path: Path, width: int, height: int, fps: float, crf: int, codec: str = "h264"
+        self,
+        path: Path,
+        width: int,
+        height: int,
+        fps: float,
+        crf: int,
+        codec: str = "h264",
+        equirectangular: bool = False,
     ) -> None:
         if width % 2 or height % 2:
             raise ValueError(f"yuv420p needs even sides, not {width}x{height}")
         self._path = path
         self._shape = (height, width, 3)
+        self._equirectangular = equirectangular
         options = _CODECS[codec]
         self._hint = (
             f"Check that the disk has room and that this ffmpeg was built with {options['vcodec']}."
@@ -116,6 +126,8 @@ class VideoWriter:
             self._program.wait(_CLOSE_LIMIT_S)
         except ToolError as failure:
             raise self._explained(failure) from failure
+        if self._equirectangular:
+            mark_equirectangular(self._path)
 
     def _put(self, data: bytes | None) -> None:
         """Hand a frame to the feeder, or None for the end. Raises why the feeder gave up."""

@@ -1,4 +1,5 @@
-"""What each training camera sees, as numbers: depth and normals beside the colours, in one zip.
+"""What training cameras, or those of a path, see, as numbers, in one zip: depth and normals beside
+the colours.
 
 Undistorted views of the trained scene from the corrected poses, `transforms.json` with their lenses
 and poses in nerfstudio's layout. Depth is z, along the camera's axis: 16-bit PNG in whole steps of
@@ -15,18 +16,23 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from pipelines.exports.export import Export
 from pipelines.exports.options import RenderingOptions
+from pipelines.exports.paths.options import PathOptions
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from pipelines.scene.cameras_file import PosedImage
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pipelines.scene.depth_views import DepthView, Pinhole
     from pipelines.scene.trained_scene import TrainedScene
+
+    _Camera = tuple[Pinhole, NDArray[np.float64], str | None]
 
 Content = Literal["rgb", "depth", "normals"]
 Format = Literal["png", "exr"]
@@ -34,8 +40,8 @@ Format = Literal["png", "exr"]
 _MILLIMETRE = 0.001
 
 
-class ViewsOptions(RenderingOptions):
-    """Depth, normals and colours of training cameras."""
+class ViewsOptions(RenderingOptions, PathOptions):
+    """Depth, normals and colours of training cameras, or along a camera path."""
 
     contents: tuple[Content, ...] = Field(
         ("rgb", "depth", "normals"),
@@ -57,8 +63,17 @@ class ViewsOptions(RenderingOptions):
         description="A step of the PNG's depth, in the world's unit; null for a millimetre where "
         "the world is metric, else the least power of ten with which the farthest depth fits.",
     )
+    cameras: Literal["training", "path"] = Field(
+        "training", description="Whose views: the training cameras', or those along the path."
+    )
     num_views: int = Field(
         0, ge=0, le=5000, description="Training views written, evenly picked; 0 for all."
+    )
+    num_frames: int = Field(
+        120,
+        ge=2,
+        le=5000,
+        description="Views along the path, where it is no camera_path, which has its own number.",
     )
     long_side_px: int = Field(
         640, ge=16, le=8192, description="Long side of the pictures, in pixels."
@@ -69,17 +84,22 @@ class ViewsOptions(RenderingOptions):
     def _each_once(cls, values: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(dict.fromkeys(values))
 
+    @model_validator(mode="after")
+    def _is_perspective(self) -> ViewsOptions:
+        if self.camera_path is not None and self.camera_path.camera_type != "perspective":
+            raise ValueError(
+                f"views are perspective; the camera_path is {self.camera_path.camera_type}"
+            )
+        return self
+
 
 def run(scene: TrainedScene, options: ViewsOptions, ctx: StageContext) -> dict[str, Any]:
     """Render and write the views."""
     # Imported where it runs: the API reads this file too.
-    import numpy as np
-
     from pipelines.exports.formats.archive import entry
     from pipelines.exports.formats.depth_pictures import unit_of
-    from pipelines.scene.depth_views import Pinhole
 
-    images = scene.training_images(options.num_views)
+    cameras = (_path_cameras if options.cameras == "path" else _training_cameras)(scene, options)
     unit = options.depth_unit
     if unit is None and scene.cameras.metric:
         unit = _MILLIMETRE
@@ -92,9 +112,7 @@ def run(scene: TrainedScene, options: ViewsOptions, ctx: StageContext) -> dict[s
         tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder,
         zipfile.ZipFile(ctx.out / "views.zip", "w") as archive,
     ):
-        for done, image in enumerate(images, start=1):
-            lens = Pinhole.of(scene.lens_of(image), options.long_side_px)
-            pose = np.asarray(image.world_from_camera, np.float64)
+        for done, (lens, pose, of) in enumerate(cameras, start=1):
             files, beyond = _write(
                 scene.depth_view(lens, pose), f"{done:05d}", Path(folder), options, unit
             )
@@ -102,9 +120,9 @@ def run(scene: TrainedScene, options: ViewsOptions, ctx: StageContext) -> dict[s
                 archive.writestr(entry(name, compressed=False), path.read_bytes())
                 path.unlink()
             num_beyond += beyond
-            frames.append(_frame(image, lens, files))
-            eta = (time.monotonic() - started) / done * (len(images) - done)
-            ctx.progress(done / len(images), f"view {done}/{len(images)}", eta)
+            frames.append(_frame(lens, pose, of, files))
+            eta = (time.monotonic() - started) / done * (len(cameras) - done)
+            ctx.progress(done / len(cameras), f"view {done}/{len(cameras)}", eta)
         archive.writestr(entry("transforms.json"), _transforms(frames, unit, scene))
     if num_beyond:
         ctx.logger.warning(
@@ -121,6 +139,37 @@ def run(scene: TrainedScene, options: ViewsOptions, ctx: StageContext) -> dict[s
         "contents": list(options.contents),
         "formats": list(options.formats),
     }
+
+
+def _training_cameras(scene: TrainedScene, options: ViewsOptions) -> list[_Camera]:
+    """Those of the training images, freed of their distortion, and the images' names."""
+    import numpy as np
+
+    from pipelines.scene.depth_views import Pinhole
+
+    return [
+        (
+            Pinhole.of(scene.lens_of(image), options.long_side_px),
+            np.asarray(image.world_from_camera, np.float64),
+            image.file,
+        )
+        for image in scene.training_images(options.num_views)
+    ]
+
+
+def _path_cameras(scene: TrainedScene, options: ViewsOptions) -> list[_Camera]:
+    """Those of the path's frames. Raises ExportError as the path does."""
+    from pipelines.exports.paths.flight import lens_of_size, make_path, typical_lens
+    from pipelines.scene.depth_views import Pinhole
+
+    images = scene.cameras.images
+    own = typical_lens([scene.lens_of(image) for image in images])
+    lens, count = Pinhole.of(own, options.long_side_px), options.num_frames
+    if options.path == "camera_path" and options.camera_path is not None:
+        file = options.camera_path
+        lens, count = lens_of_size(own, file.render_width, file.render_height), file.frames()
+    flight = make_path(options, images, count)
+    return [(flight.lens(index, lens), pose, None) for index, pose in enumerate(flight.poses)]
 
 
 def _write(
@@ -155,8 +204,10 @@ def _write(
     return files, beyond
 
 
-def _frame(image: PosedImage, lens: Pinhole, files: Iterable[str]) -> dict[str, Any]:
-    """The entry of `transforms.json` for one view."""
+def _frame(
+    lens: Pinhole, pose: NDArray[np.float64], of: str | None, files: Iterable[str]
+) -> dict[str, Any]:
+    """The entry of `transforms.json` for one view. of: the image that its camera took."""
     names = sorted(files)
     pictures = {name.split("/")[0]: name for name in names if name.endswith(".png")}
     return {
@@ -164,9 +215,9 @@ def _frame(image: PosedImage, lens: Pinhole, files: Iterable[str]) -> dict[str, 
         **({"depth_file_path": pictures["depth"]} if "depth" in pictures else {}),
         **{"w": lens.width, "h": lens.height, "fl_x": lens.fl_x, "fl_y": lens.fl_y},
         **{"cx": lens.cx, "cy": lens.cy},
-        "transform_matrix": [*map(list, image.world_from_camera), [0.0, 0.0, 0.0, 1.0]],
+        "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
         "files": names,
-        "of": image.file,
+        **({} if of is None else {"of": of}),
     }
 
 
@@ -188,7 +239,7 @@ def _transforms(frames: list[dict[str, Any]], unit: float, scene: TrainedScene) 
 
 EXPORT = Export(
     kind="views",
-    version=1,
+    version=2,
     run=run,
     options=ViewsOptions,
     on_request=True,

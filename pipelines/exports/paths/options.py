@@ -15,6 +15,9 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pipelines.exports.paths.catalogue import PATHS
 from pipelines.option_models import StageOptions
 
+CameraType = Literal["perspective", "fisheye", "equirectangular"]
+"""Named as nerfstudio's files name them."""
+
 _World = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Fov = Annotated[float, Field(ge=1.0, le=150.0)]
 _Point = tuple[_World, _World, _World]
@@ -156,7 +159,7 @@ class NerfstudioKeyframe(_Nerfstudio):
 class NerfstudioPath(_Nerfstudio):
     """nerfstudio's camera_path.json, as it is; poses are taken for the world of cameras.json."""
 
-    camera_type: Literal["perspective"] = "perspective"
+    camera_type: CameraType = "perspective"
     render_height: int = Field(ge=16, le=MAX_SIDE_PX)
     render_width: int = Field(ge=16, le=MAX_SIDE_PX)
     fps: float = Field(ge=1, le=120)
@@ -222,7 +225,7 @@ class PathOptions(StageOptions):
     camera_path: NerfstudioPath | None = Field(
         None,
         description="Of the path camera_path: nerfstudio's camera_path.json as it is. Its size, "
-        "frames per second and length count instead of those here.",
+        "camera type, frames per second and length count instead of those here.",
     )
 
     @model_validator(mode="after")

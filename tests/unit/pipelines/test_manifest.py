@@ -284,7 +284,8 @@ def test_a_job_runs_what_neither_capture_nor_preset_leave_out(
 def test_what_is_on_request_runs_where_it_has_options(
     tmp_path: Path, empty_stages: list[str]
 ) -> None:
-    run_job_locally(Workspace(tmp_path), "preview", {"views": {"num_views": 3}}, kind="video")
+    wish = {"views": {"num_views": 3}, "meshvideo": {}}
+    run_job_locally(Workspace(tmp_path), "preview", wish, kind="video")
     assert empty_stages == list(STAGE_NAMES)
 
 

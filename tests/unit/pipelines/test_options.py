@@ -37,9 +37,10 @@ def test_a_preset_leaves_out_no_stage_that_another_needs(preset: str) -> None:
 
 
 def test_a_job_skips_for_its_preset_and_for_its_capture() -> None:
-    assert stages_skipped("preview", "video") == ON_REQUEST == {"views"}
-    assert stages_skipped("preview", "video", {"views": {}}) == frozenset()
-    assert stages_skipped("preview", "polycam") == skipped_stages("polycam") | {"views"}
+    assert stages_skipped("preview", "video") == ON_REQUEST == {"views", "meshvideo"}
+    assert stages_skipped("preview", "video", {"views": {}}) == {"meshvideo"}
+    assert stages_skipped("preview", "video", {"views": {}, "meshvideo": {}}) == frozenset()
+    assert stages_skipped("preview", "polycam") == skipped_stages("polycam") | ON_REQUEST
     assert "views" in stages_skipped("draft", "video", {"views": {}})
     kept = set(STAGE_NAMES) - stages_skipped("draft", "video")
     assert kept == {"ingest", "frames", "poses", "depth", "draft", "report"}

@@ -106,6 +106,19 @@ def test_a_cancel_ends_the_stage(job: Workspace) -> None:
     assert not job.stage("mesh").exists()
 
 
+@pytest.mark.parametrize("part", ["fusing depth", "painting"])
+def test_a_cancel_is_noticed_at_the_next_word_of_any_part(job: Workspace, part: str) -> None:
+    messages: list[str] = []
+    hooks = RunHooks(
+        on_progress=lambda fraction, message, eta_s: messages.append(message),
+        is_cancelled=lambda: part in messages,
+    )
+    with pytest.raises(Cancelled):
+        tiny_job.run_with(job, "mesh", hooks, lods=1)
+    assert messages.count(part) == 1, "it says no more after the cancel"
+    assert not job.stage("mesh").exists()
+
+
 def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -> None:
     summary = tiny_job.run(job, "mesh", lods=2)["summary"]
     full = read_mesh(job.stage("mesh") / "mesh.glb")

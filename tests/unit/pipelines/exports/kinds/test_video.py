@@ -129,6 +129,78 @@ def test_keyframes_zoom_and_a_file_of_nerfstudios_sets_the_size(job: Workspace) 
     assert off < 0.5 * np.abs(wide.astype(float) - near).mean()
 
 
+def _pose_of_the_middle(job: Workspace) -> list[float]:
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    return np.vstack([cameras.images[4].world_from_camera, [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
+
+
+def _pictures(job: Workspace, **changes: Any) -> dict[str, np.ndarray]:
+    """The frame of a flight that stands still, by output."""
+    pose = _pose_of_the_middle(job)
+    options = {
+        "path": "camera_path",
+        "codec": "png",
+        "camera_path": {
+            "fps": 10,
+            "camera_path": [{"camera_to_world": pose, "fov": 60.0}] * 2,
+            **changes,
+        },
+    }
+    tiny_job.run(job, "video", outputs=OUTPUTS, **options)
+    with zipfile.ZipFile(job.stage("video") / "video-frames.zip") as archive:
+        return {
+            name: np.asarray(Image.open(archive.open(f"{name}/00001.png"))).astype(float)
+            for name in OUTPUTS
+        }
+
+
+def test_wide_lenses_show_what_a_plain_one_shows_and_more(job: Workspace) -> None:
+    """Each pixel of the plain picture is where the lens formula of the wide one has its ray."""
+    plain = _pictures(job, render_width=48, render_height=48)
+    focal = 24.0 / np.tan(np.radians(30.0))
+    x, y = np.meshgrid(np.arange(48) + 0.5 - 24.0, np.arange(48) + 0.5 - 24.0)
+    ray = np.stack([x, y, np.full_like(x, focal)], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+
+    fish = _pictures(job, render_width=96, render_height=96, camera_type="fisheye")
+    fish_focal = 48.0 / np.tan(np.radians(30.0))
+    angle = np.arccos(ray[..., 2])
+    out = fish_focal * angle / np.maximum(np.hypot(x, y), 1e-9)
+    _is_seen_at(plain, fish, 48.0 + out * x, 48.0 + out * y)
+
+    sphere = _pictures(job, render_width=192, render_height=96, camera_type="equirectangular")
+    column = 96.0 + 96.0 * np.arctan2(ray[..., 0], ray[..., 2]) / np.pi
+    row = 48.0 + 96.0 * np.arcsin(ray[..., 1]) / np.pi
+    _is_seen_at(plain, sphere, column, row)
+    # All round: the first column looks the same way as the last.
+    step = np.abs(sphere["rgb"][:, 0] - sphere["rgb"][:, -1]).mean()
+    assert step < np.abs(sphere["rgb"][:, 0] - sphere["rgb"][:, 96]).mean()
+
+
+def _is_seen_at(
+    plain: dict[str, np.ndarray], wide: dict[str, np.ndarray], column: np.ndarray, row: np.ndarray
+) -> None:
+    for name in OUTPUTS:
+        found = wide[name][np.floor(row).astype(int), np.floor(column).astype(int)]
+        right = np.median(np.abs(found - plain[name]))
+        wrong = np.median(np.abs(found[:, ::-1] - plain[name]))
+        assert right < max(0.6 * wrong, 6.0), (name, right, wrong)
+
+
+def test_a_fisheye_is_a_circle_and_a_sphere_says_what_it_is(job: Workspace) -> None:
+    tiny_job.run(job, "video", camera="fisheye", num_frames=8, codec="png", outputs=("normals",))
+    with zipfile.ZipFile(job.stage("video") / "video-frames.zip") as archive:
+        picture = np.asarray(Image.open(archive.open("normals/00004.png")))
+    assert picture.shape == (64, 64, 3)
+    assert not picture[0, 0].any()
+    assert picture[32, 1].any()
+    tiny_job.run(job, "video", camera="equirectangular", num_frames=8)
+    info = probe(job.stage("video") / "video.mp4")
+    assert (info.width, info.height, info.projection) == (64, 32, "equirectangular")
+    with Image.open(job.stage("video") / "preview.jpg") as preview:
+        assert preview.height > preview.width, "the preview is a plain picture"
+
+
 def test_a_failing_encoder_leaves_no_half_written_file(
     job: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,6 +239,32 @@ def test_a_failing_encoder_leaves_no_half_written_file(
         ({"keyframes": [{"position": [0, 0, 0], "rotation": [0, 0, 0, 0]}]}, "must not be 0"),
         ({"keyframes": [{"position": [0, 0, 0], "look_at": [0, 0, 0]}]}, "position itself"),
         ({"path": "camera_path"}, "needs the option camera_path"),
+        ({"camera": "cubemap"}, "'perspective', 'fisheye' or 'equirectangular'"),
+        ({"fisheye_fov_deg": 0}, "greater than or equal to 20"),
+        ({"fisheye_fov_deg": 360}, "less than or equal to 220"),
+        (
+            {"camera": "equirectangular", "width_px": 640, "height_px": 480},
+            "twice as wide as it is high, not 640x480",
+        ),
+        (
+            {
+                "camera": "equirectangular",
+                "outputs": ["rgb", "depth"],
+                "layout": "side_by_side",
+            },
+            "cannot have several outputs side by side",
+        ),
+        (
+            {
+                "camera": "fisheye",
+                "path": "keyframes",
+                "keyframes": [
+                    {"position": [0, 0, 0], "look_at": [1, 0, 0], "fov_deg": 50},
+                    {"position": [0, 1, 0], "look_at": [1, 0, 0], "fov_deg": 50},
+                ],
+            },
+            "for perspective cameras; the camera is fisheye",
+        ),
         ({"path": "teleport"}, "'smooth', 'orbit'"),
         ({"orbit": {"height": 1.0}}, "less than or equal to 0.98"),
         ({"spiral": {"radius": 0.0}}, "greater than 0"),

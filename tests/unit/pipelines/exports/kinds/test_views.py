@@ -141,3 +141,35 @@ def test_wrong_requests_are_refused_with_the_range(wrong: dict[str, Any], told: 
     with pytest.raises(OptionsError) as caught:
         resolve_options("preview", {"views": wrong})
     assert told in str(caught.value)
+
+
+def test_a_path_has_depth_and_normals_of_each_frame(job: Workspace, tmp_path: Path) -> None:
+    place = {"look_at": [0.0, 0.0, 0.3]}
+    keyframes = [{"position": [x, -1.5, 1.0], **place, "fov_deg": 50} for x in (-0.5, 0.5)]
+    path = {"cameras": "path", "path": "keyframes", "keyframes": keyframes, "num_frames": 4}
+    summary = tiny_job.run(job, "views", **path)["summary"]
+    assert summary["num_views"] == 4
+    with zipfile.ZipFile(job.stage("views") / "views.zip") as archive:
+        told = json.loads(archive.read("transforms.json"))
+        depth = exr(archive.read("depth/00001.exr"), tmp_path)["Z"]
+    first = told["frames"][0]
+    assert "of" not in first
+    np.testing.assert_allclose(np.asarray(first["transform_matrix"])[:3, 3], [-0.5, -1.5, 1.0])
+    fov = 2.0 * np.degrees(np.arctan(first["h"] / 2.0 / first["fl_y"]))
+    assert fov == pytest.approx(50.0)
+    scene = TrainedScene.load(job.stage("train") / "model.zip")
+    lens = Pinhole(*(first[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")))
+    view = scene.depth_view(lens, np.asarray(first["transform_matrix"])[:3])
+    np.testing.assert_allclose(depth, view.z_depth, rtol=1e-5)
+
+
+def test_views_of_a_wide_lens_are_refused() -> None:
+    pose = np.eye(4).ravel().tolist()
+    file = {"render_width": 64, "render_height": 32, "fps": 10, "camera_type": "equirectangular"}
+    wish = {
+        "path": "camera_path",
+        "camera_path": {**file, "camera_path": [{"camera_to_world": pose, "fov": 50}]},
+    }
+    with pytest.raises(OptionsError) as caught:
+        resolve_options("preview", {"views": wish})
+    assert "views are perspective" in str(caught.value)

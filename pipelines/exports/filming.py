@@ -1,0 +1,153 @@
+"""A flight filmed: frames drawn one after the other, into videos or a zip of pictures.
+
+Outputs are named; each is a file of its own, or all of them stand side by side in one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.exports import shades
+from pipelines.exports.flight_options import FlightOptions
+from pipelines.exports.formats.mp4 import VideoWriter
+from pipelines.exports.formats.png_frames import FramesWriter
+from pipelines.exports.paths.flight import Flight
+from pipelines.exports.shots import Lens, MeshStudio, Shot, shot_of
+from pipelines.scene.trained_scene import TrainedScene
+from pipelines.stage import StageContext
+
+Floats = NDArray[np.float64]
+Frames = dict[str, NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class Film:
+    """outputs: in order. files: the video of each output, or the one of all. pictures: the zip in
+    place of them. together: whether outputs stand side by side."""
+
+    options: FlightOptions
+    outputs: Sequence[str]
+    files: Mapping[str, str]
+    pictures: str
+    together: bool
+
+    def width(self, lens: Lens) -> int:
+        """Of a picture, px."""
+        return lens.size[0] * (len(self.outputs) if self.together else 1)
+
+    def told(self, num_frames: int, lens: Lens, folder: Path) -> dict[str, Any]:
+        """What the report says of it."""
+        fps, made = self.options.frame_rate(), (*self.files.values(), self.pictures)
+        return {
+            "path": self.options.path,
+            "camera": self.options.camera_type(),
+            "codec": self.options.codec,
+            "num_frames": num_frames,
+            "width": self.width(lens),
+            "height": lens.size[1],
+            "fps": fps,
+            "duration_s": round(num_frames / fps, 3),
+            "bytes": sum(
+                (folder / name).stat().st_size for name in made if (folder / name).exists()
+            ),
+        }
+
+
+def make_film(
+    scene: TrainedScene,
+    film: Film,
+    flight: Flight,
+    lens: Lens,
+    ctx: StageContext,
+    mesh: MeshStudio | None = None,
+) -> None:
+    """Render and write all frames. mesh: for the output of that name. Raises ToolError."""
+    draw = _drawer(scene, film, lens, ctx, mesh)
+    started, count = time.monotonic(), len(flight)
+    with _writer(film, ctx, lens) as write:
+        for index, pose in enumerate(flight.poses):
+            write(draw(index, pose))
+            done = index + 1
+            eta = (time.monotonic() - started) / done * (count - done)
+            ctx.progress(done / (count + 4), f"frame {done}/{count}", eta)
+
+
+def _drawer(
+    scene: TrainedScene, film: Film, lens: Lens, ctx: StageContext, mesh: MeshStudio | None
+) -> Callable[[int, Floats], Frames]:
+    """What draws a frame of each output."""
+    between = None
+    if "depth" in film.outputs:
+        ctx.progress(0.0, "looking for the range of depths")
+        between = shades.range_of_views(scene.probe_views(ctx.check_cancelled))
+    painters: dict[str, Callable[[Shot], NDArray[np.uint8]]] = {
+        "rgb": lambda shot: shot.rgb,
+        "depth": lambda shot: shades.depth_picture(shot.depth, between),
+        "normals": lambda shot: shades.normals_picture(shot.normals()),
+        "accumulation": lambda shot: shades.accumulation_picture(shot.accumulation),
+    }
+
+    def draw(index: int, pose: Floats) -> Frames:
+        seen_through, circle = lens.of(index), lens.circle(index)
+        frames: Frames = {}
+        if set(film.outputs) != {"mesh"}:
+            shot = shot_of(scene, seen_through, pose, circle)
+            frames = {name: painters[name](shot) for name in film.outputs if name != "mesh"}
+            if circle is not None:
+                # What is unknown is grey; beyond the circle there is nothing to know.
+                frames = {
+                    name: np.where(circle[..., None], picture, np.uint8(0))
+                    for name, picture in frames.items()
+                }
+        if mesh is not None:
+            frames["mesh"] = mesh.picture(seen_through, pose, circle)
+        return {name: frames[name] for name in film.outputs}
+
+    return draw
+
+
+@contextlib.contextmanager
+def _writer(film: Film, ctx: StageContext, lens: Lens) -> Iterator[Callable[[Frames], None]]:
+    """What writes a frame of each output, into files that are whole when the block is left."""
+    options = film.options
+    with contextlib.ExitStack() as stack:
+        if options.codec == "png":
+            frames = stack.enter_context(FramesWriter(ctx.out / film.pictures))
+
+            def write_pictures(shown: Frames) -> None:
+                if film.together:
+                    shown = {"side_by_side": np.concatenate(list(shown.values()), axis=1)}
+                for name, picture in shown.items():
+                    frames.write(name, picture)
+
+            yield write_pictures
+            return
+        size = (film.width(lens), lens.size[1])
+        writers = {
+            name: stack.enter_context(
+                VideoWriter(
+                    ctx.out / file,
+                    *(*size, options.frame_rate(), options.crf, options.codec),
+                    equirectangular=options.camera_type() == "equirectangular",
+                )
+            )
+            for name, file in film.files.items()
+        }
+
+        def write(shown: Frames) -> None:
+            if film.together:
+                (only,) = writers.values()
+                only.write(np.concatenate(list(shown.values()), axis=1))
+                return
+            for name, picture in shown.items():
+                writers[name].write(picture)
+
+        yield write

@@ -1,0 +1,154 @@
+"""One frame of a flight as numbers: what a lens sees of the trained scene, or of its mesh.
+
+A perspective lens is a `Pinhole`; its depth is z, along the camera's axis. Wide lenses, which no
+plane can show, are an equidistant fisheye (its circle within the picture, black around it) and the
+equirectangular sphere; their depth is the distance along the ray. [H, W] pictures, world units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.exports import shades
+from pipelines.exports.flight_options import FlightOptions
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+from pipelines.exports.paths.flight import Flight, lens_of_size
+from pipelines.judging.asset_views import MeshCaster, Texture
+from pipelines.nerf.space.cameras import SceneTransform, panorama_intrinsics
+from pipelines.scene.cameras_file import Intrinsics
+from pipelines.scene.depth_views import Pinhole, surface_distance, without_jumps
+from pipelines.scene.trained_scene import TrainedScene, as_array, as_uint8, nerf_cameras
+
+Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+_HERE = np.eye(3, 4)
+_NO_MOVE = SceneTransform((0.0, 0.0, 0.0), 1.0)
+_AROUND_MESH = 31
+"""Grey where there is no mesh, as no surface is black all round."""
+_SAMPLES = 2
+"""Rays along each side of a pixel of the mesh."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """rgb: [H, W, 3]. depth: 0 where unknown. accumulation: in [0, 1]. normals: makes [H, W, 3],
+    camera axes."""
+
+    rgb: Bytes
+    depth: NDArray[np.float32]
+    accumulation: Floats
+    normals: Callable[[], NDArray[np.float32]]
+
+
+class Lens:
+    """The lens of each frame of a flight. own: the capture's typical one."""
+
+    def __init__(self, options: FlightOptions, own: Intrinsics, flight: Flight) -> None:
+        self._kind = options.camera_type()
+        self._flight = flight
+        self._fov_deg = options.fisheye_fov_deg
+        self._plain = (
+            lens_of_size(own, *options.size())
+            if options.has_own_size()
+            else Pinhole.of(own, options.long_side_px, multiple=2)
+        )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self._plain.width, self._plain.height
+
+    def plain(self, index: int) -> Pinhole:
+        """A perspective lens of the same size for a frame, whatever lens films it."""
+        return self._flight.lens(index, self._plain)
+
+    def of(self, index: int) -> Pinhole | Intrinsics:
+        """The lens of a frame."""
+        width, height = self.size
+        if self._kind == "perspective":
+            return self.plain(index)
+        if self._kind == "equirectangular":
+            (fl_x, fl_y), (cx, cy) = panorama_intrinsics(width, height)
+            return Intrinsics(width, height, fl_x, fl_y, cx, cy, "EQUIRECTANGULAR")
+        if self._flight.fov_deg is not None:
+            # nerfstudio's files: the focal length is that of a perspective lens of the same angle.
+            focal = self.plain(index).fl_y
+        else:
+            focal = min(width, height) / math.radians(self._fov_deg)
+        return Intrinsics(width, height, focal, focal, width / 2, height / 2, "OPENCV_FISHEYE")
+
+    def circle(self, index: int) -> NDArray[np.bool_] | None:
+        """[H, W], what of the picture shows something; None where all of it does."""
+        if self._kind != "fisheye":
+            return None
+        lens = self.of(index)
+        x = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fl_x
+        y = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fl_y
+        farthest = math.pi if self._flight.fov_deg is not None else math.radians(self._fov_deg) / 2
+        shown: NDArray[np.bool_] = np.hypot(x[None, :], y[:, None]) <= farthest
+        return shown
+
+
+def shot_of(
+    scene: TrainedScene,
+    lens: Pinhole | Intrinsics,
+    pose: Floats,
+    circle: NDArray[np.bool_] | None = None,
+) -> Shot:
+    """What a lens sees of the trained scene from a world pose; nothing beyond the circle."""
+    if isinstance(lens, Pinhole):
+        view, accumulation = scene.seen(lens, pose)
+        return Shot(view.rgb, view.z_depth, accumulation, lambda: shades.normals_of(view))
+    seen = scene.render(lens, pose)
+    accumulation = as_array(seen.accumulation)
+    rgb = as_uint8(seen.rgb)
+    if circle is not None:
+        accumulation = np.where(circle, accumulation, 0.0)
+        rgb = np.where(circle[..., None], rgb, np.uint8(0))
+    distance = surface_distance(as_array(seen.depth), as_array(seen.expected_depth), accumulation)
+
+    def normals() -> NDArray[np.float32]:
+        points = directions_of(lens) * distance[..., None]
+        return shades.normals_of_points(points, without_jumps(distance, _angle_of(lens)))
+
+    return Shot(rgb, distance.astype(np.float32), accumulation, normals)
+
+
+def directions_of(lens: Intrinsics) -> Floats:
+    """[H, W, 3] unit rays of all pixels, in the camera's axes."""
+    cameras = nerf_cameras([lens], [_HERE], _NO_MOVE)
+    rays = cameras.image_rays(0).directions.numpy().astype(np.float64)
+    grid: Floats = rays.reshape(lens.height, lens.width, 3)
+    return grid
+
+
+def _angle_of(lens: Intrinsics) -> float:
+    """Between neighbouring pixels in the middle of a wide picture, radians."""
+    return math.tau / lens.width if lens.model == "EQUIRECTANGULAR" else 1.0 / lens.fl_x
+
+
+class MeshStudio:
+    """A delivered mesh, to be filmed."""
+
+    def __init__(self, mesh: TriangleMesh | TexturedMesh) -> None:
+        # float32 rays do not reach far from the origin of a georeferenced world.
+        self._frame = SceneTransform.fit(mesh.vertices, scale_poses=False)
+        colors = Texture(mesh.uv, mesh.texture) if isinstance(mesh, TexturedMesh) else mesh.colors
+        self._caster = MeshCaster(self._frame.scene_from_world(mesh.vertices), mesh.faces, colors)
+
+    def picture(
+        self, lens: Pinhole | Intrinsics, pose: Floats, circle: NDArray[np.bool_] | None = None
+    ) -> Bytes:
+        """[H, W, 3]: the mesh from a world pose, both sides of its faces."""
+        full = lens.intrinsics() if isinstance(lens, Pinhole) else lens
+        view = self._caster.view(nerf_cameras([full], [pose], self._frame), 0, samples=_SAMPLES)
+        picture = np.where(view.hit[..., None], as_uint8(view.color), np.uint8(_AROUND_MESH))
+        if circle is not None:
+            picture = np.where(circle[..., None], picture, np.uint8(0))
+        return picture
