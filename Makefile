@@ -12,7 +12,7 @@ MINUTES ?= 5
 export CAPTURE HOST PORT
 
 .DEFAULT_GOAL := help
-.PHONY: help demo up test check fix mutants install install-test lock clean
+.PHONY: help demo up test check fix chaos mutants install install-test lock clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
@@ -36,6 +36,9 @@ check: install-test ## Lint, types and import rules
 fix: install-test ## Format and mend what can be mended
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
+
+chaos: install-test ## Shake the whole service for 8 minutes, judge what is left: [SEED=7]
+	@$(BIN)/python -W ignore::UserWarning -m tests.chaos $(if $(SEED),--seed $(SEED))
 
 mutants: install-test ## Plant faults, count those tests notice: 40 minutes at most, or [MINUTES=5] a group
 	@$(PIP) install --quiet --editable '.[mutants]'

