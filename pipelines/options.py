@@ -46,6 +46,19 @@ class IngestOptions(StageOptions):
     max_unpacked_bytes: int = Field(
         20 * 2**30, ge=2**20, le=2**40, description="Most bytes an archive may unpack to."
     )
+    projection: Literal["auto", "flat", "equirectangular"] = Field(
+        "auto",
+        description="What videos and photos without poses show: a plain view, or the whole sphere "
+        "as an equirectangular panorama. auto believes what the files say of themselves.",
+    )
+    panorama_views: int = Field(
+        4,
+        ge=4,
+        le=6,
+        description="Views of 90 degrees that are cut from a panorama of the whole sphere: 4 "
+        "around the horizon, 5 with the one upwards, 6 with the one downwards, where mostly the "
+        "camera's bearer is.",
+    )
 
 
 class FramesOptions(StageOptions):

@@ -52,7 +52,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=3,
+        version=4,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",

@@ -4,8 +4,9 @@ JOB/
   input/capture             the uploaded bytes, as they came
   job.json                  filename, kind, seed: what the stages may know of the job
   ingest/                   capture.json, images/ (photos and app exports), cameras.json (posed),
-                            points.ply (posed, where sparse points came along)
-  frames/                   frames.json, images/ (only for videos)
+                            points.ply (posed, where sparse points came along), panoramas/ (of
+                            the whole sphere: their views are in images/)
+  frames/                   frames.json, images/, panoramas/ (only for videos)
   poses/                    cameras.json, report.json, points.ply (only where no poses came)
   depth/                    maps.json, maps/, depth.jpg, report.json
   draft/                    draft.glb, draft.jpg

@@ -32,11 +32,16 @@ _CHECKED_BEFORE = ArchiveLimits(max_unpacked_bytes=2**62)
 
 @dataclass(frozen=True)
 class Clip:
-    """One clip. name: see the module. start_s: time of its first frame. video: as `VideoInfo`."""
+    """One clip.
+
+    name: see the module. start_s: time of its first frame. video: as `VideoInfo`. num_views: how
+    many views are cut from each frame; 0 where frames are not panoramas.
+    """
 
     name: str
     start_s: float
     video: dict[str, Any]
+    num_views: int = 0
 
     @property
     def num_frames(self) -> int:
@@ -58,7 +63,7 @@ def read_film(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
     """An upload that is a video. Raises CaptureError as `video.check` does, and video_too_long."""
     checked = check(path, options, ctx, minimum=MIN_IMAGES)
     _check_length([checked], options)
-    clip = _clip("", checked)
+    clip = _clip("", checked, options)
     return Found(
         video=clip.video,
         clips=[asdict(clip)],
@@ -91,7 +96,7 @@ def read_films(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
     if not found:
         raise next(iter(unusable.values()))
     _check_length(list(found.values()), options)
-    clips = [_clip(name, checked) for name, checked in found.items()]
+    clips = [_clip(name, checked, options) for name, checked in found.items()]
     num_frames = sum(clip.num_frames for clip in clips)
     if num_frames < MIN_IMAGES:
         raise CaptureError(
@@ -162,8 +167,9 @@ def _clip_names(archive: CaptureArchive) -> list[str]:
     return names
 
 
-def _clip(name: str, checked: Checked) -> Clip:
-    return Clip(name, checked.start_s, checked.info.as_dict())
+def _clip(name: str, checked: Checked, options: IngestOptions) -> Clip:
+    num_views = options.panorama_views if checked.info.projection else 0
+    return Clip(name, checked.start_s, checked.info.as_dict(), num_views)
 
 
 def _check_length(clips: Sequence[Checked], options: IngestOptions) -> None:

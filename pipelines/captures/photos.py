@@ -1,18 +1,24 @@
-"""Photos without poses: chosen, decoded, turned upright, in their natural order."""
+"""Photos without poses: chosen, decoded, turned upright, in order; panoramas cut into views."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
+from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import Photos
 from pipelines.captures.minimum import MIN_IMAGES
+from pipelines.captures.panorama_files import EQUIRECTANGULAR, FOLDER, write_views
 from pipelines.captures.photo_choice import choose_photos
 from pipelines.captures.pictures import Picture, PictureWriter
 from pipelines.captures.record import Found
 from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
+from pipelines.errors import CaptureError
 from pipelines.options import IngestOptions
 from pipelines.scene.natural_order import natural_key
+from pipelines.scene.panoramas import is_whole
 from pipelines.stage import StageContext
 
 
@@ -32,7 +38,7 @@ def write_photos(
     pictures, warnings = store_each(
         archive,
         [_Photo(name) for name in sorted(names, key=natural_key)],
-        _store,
+        partial(_store, ctx.out, options),
         options,
         ctx,
         upright=True,
@@ -46,5 +52,24 @@ def write_photos(
     )
 
 
-def _store(writer: PictureWriter, photo: _Photo, number: int) -> Picture:
-    return writer.store(photo.name, number)
+def _store(
+    out: Path, options: IngestOptions, writer: PictureWriter, photo: _Photo, number: int
+) -> Picture:
+    picture = writer.store(photo.name, number)
+    told = options.projection == EQUIRECTANGULAR
+    if options.projection == "flat" or not (told or picture.projection == EQUIRECTANGULAR):
+        return picture
+    if not is_whole(picture.width, picture.height):
+        if not told:
+            return picture
+        raise CaptureError(
+            f'The picture "{shown(photo.name)}" is {picture.width}x{picture.height}; a panorama of '
+            "the whole sphere is twice as wide as high.",
+            code="image_undecodable",
+            hint="Leave the picture out, or set ingest.projection to auto.",
+        )
+    (out / FOLDER).mkdir(exist_ok=True)
+    panorama = f"{FOLDER}/{picture.file.rpartition('/')[2]}"
+    (out / picture.file).rename(out / panorama)
+    views = write_views(out / panorama, out, f"{number:05d}", options.panorama_views)
+    return replace(picture, file=panorama, views=tuple(views))

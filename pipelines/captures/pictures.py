@@ -20,6 +20,7 @@ import PIL.ImageOps
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.color_profiles import in_srgb
 from pipelines.captures.exif import Exif, read_exif
+from pipelines.captures.panorama_files import photo_projection
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 
@@ -32,13 +33,19 @@ _HARMLESS_PNG_KEYS = frozenset({"dpi", "gamma", "srgb", "aspect", "interlace"})
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as written. file: relative to the stage's folder. source: its name as sent."""
+    """A picture as written.
+
+    file: relative to the stage's folder. source: its name as sent. projection: as its XMP names it,
+    "" for a plain view. views: files of those that were cut from it, where it is a panorama.
+    """
 
     file: str
     source: str
     width: int
     height: int
     exif: Exif
+    projection: str = ""
+    views: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """As plain JSON, for `capture.json`."""
@@ -48,6 +55,7 @@ class Picture:
             "width": self.width,
             "height": self.height,
             "exif": self.exif.as_dict(),
+            **({"views": list(self.views)} if self.views else {}),
         }
 
 
@@ -100,20 +108,21 @@ class PictureWriter:
     def _store(self, raw: Path, kind: str, name: str, number: int) -> Picture:
         with self._opened(raw, name, kind) as image:
             exif = read_exif(image)
+            projection = photo_projection(image)
             turned = self._upright and exif.orientation not in (None, 1)
             suffix = ".png" if kind == "PNG" else ".jpg"
             file = f"images/{number:05d}{suffix}"
             target = self._out / file
             if not turned and _is_clean(image, raw):
                 shutil.copyfile(raw, target)
-                return Picture(file, name, image.width, image.height, exif)
+                return Picture(file, name, image.width, image.height, exif, projection)
             upright = PIL.ImageOps.exif_transpose(image) if turned else image
             plain = _plain_rgb(self._in_srgb(_eight_bit(upright), name))
             if suffix == ".png":
                 plain.save(target, "PNG", compress_level=3)
             else:
                 plain.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-            return Picture(file, name, plain.width, plain.height, exif)
+            return Picture(file, name, plain.width, plain.height, exif, projection)
 
     @property
     def warnings(self) -> list[str]:

@@ -29,13 +29,14 @@ def capture_order(
 
     poses: [N, 3, 4]. names: paths of the images. timestamps_s: capture times where known.
     By time where every image has one, else by name; where that order jumps about (a photo set
-    named at random) by a short tour through neighbouring poses. Returns indices, [M], M <= N.
+    named at random) by a short tour through neighbouring poses. Of the views of a panorama, which
+    were taken in one place, the first is in the order. Returns indices, [M], M <= N.
     """
     if all(time is not None for time in timestamps_s):
         order = sorted(range(len(names)), key=lambda i: (float(timestamps_s[i] or 0.0), names[i]))
     else:
         order = sorted(range(len(names)), key=lambda i: natural_key(names[i]))
-    indices = np.asarray(order, dtype=np.int64)
+    indices = _first_in_each_place(np.asarray(order, dtype=np.int64), poses)
     if len(indices) < 4:
         return indices
     if len(indices) > _MAX_UNORDERED:
@@ -50,6 +51,15 @@ def capture_order(
         return indices
     tour: Indices = probe[short_tour(distance)]
     return tour
+
+
+def _first_in_each_place(order: Indices, poses: Floats) -> Indices:
+    """The order without images that were taken exactly where the one before them was."""
+    centers = poses[order, :, 3]
+    moved = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    reach = np.abs(centers - centers.mean(axis=0)).max(initial=0.0)
+    kept: Indices = order[np.concatenate([[True], moved > 1e-9 * reach])] if reach > 0 else order
+    return kept
 
 
 def short_tour(distance: Floats) -> Indices:

@@ -44,7 +44,10 @@ NUM_PROBES = 5
 ENOUGH_FEATURES = 500
 """Median of the probes from which images are not doubled before features are found."""
 
-_FORMAT = 3
+PANORAMA_FACTOR = 2
+"""Panoramas are looked at so many times as large as other images, for so many more features."""
+
+_FORMAT = 4
 """Of the checkpoint: raised where the same options give other databases or names of steps."""
 
 Span = tuple[float, float]
@@ -205,8 +208,10 @@ class Ladder:
 
     def _settings(self, *, upsample: bool) -> FeatureSettings:
         options = self._options
+        # A panorama shows a third of itself where another picture shows all.
+        more = PANORAMA_FACTOR if self._source.has_panoramas else 1
         wanted = FeatureSettings(
-            options.max_image_px, options.num_features, upsample, options.num_threads
+            more * options.max_image_px, more * options.num_features, upsample, options.num_threads
         )
         threads = extraction_threads(wanted, options.memory_mb, _num_processors())
         return replace(wanted, num_threads=threads)

@@ -30,6 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipelines.scene.cameras_file import Intrinsics
+from pipelines.scene.panoramas import MODEL as PANORAMA
 from pipelines.tools.colmap_lenses import Fit, LensTrials
 from pipelines.tools.colmap_results import SparseModel
 
@@ -126,6 +127,24 @@ class LensVerdict:
 def mapping_lens(wanted: str) -> str:
     """The lens that mapping starts with, for `poses.camera_model`."""
     return LENSES[0] if wanted == AUTO else wanted
+
+
+def unsettled(model: SparseModel) -> tuple[LensVerdict, ...]:
+    """What is said of the lenses of a model with panoramas, which are left as they were mapped."""
+    counts = [model.camera_of.count(camera) for camera in range(len(model.cameras))]
+    return tuple(
+        LensVerdict(
+            num_images=counts[camera],
+            lens=model.cameras[camera].model,
+            why="a panorama has no lens to fit"
+            if model.cameras[camera].model == PANORAMA
+            else "left as it was mapped, beside panoramas",
+            focal_px=(model.cameras[camera].fl_x + model.cameras[camera].fl_y) / 2,
+            focal_spread=None,
+            candidates=(),
+        )
+        for camera in sorted(range(len(counts)), key=lambda camera: -counts[camera])
+    )
 
 
 def settle_lenses(

@@ -15,6 +15,7 @@ from typing import Any
 from PIL import Image, UnidentifiedImageError
 
 from pipelines.errors import CaptureError
+from pipelines.scene.panoramas import MODEL as PANORAMA
 from pipelines.tools.colmap import CameraGroup
 from pipelines.workspace import Workspace
 
@@ -35,7 +36,8 @@ class Source:
     film, None for photos and for frames whose time the file does not say. is_video: whether
     neighbours in the list are neighbours in time. exif: what the record says of each photo.
     clips: of a film, the clip that each frame is of, ascending; neighbours of one clip only are
-    neighbours in time.
+    neighbours in time. views: for each image the views that were cut from it, none of one that is
+    no panorama; of a capture without panoramas nothing at all.
     """
 
     root: Path
@@ -44,6 +46,16 @@ class Source:
     is_video: bool
     exif: tuple[Mapping[str, Any], ...] = ()
     clips: tuple[int, ...] = ()
+    views: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def has_panoramas(self) -> bool:
+        """Whether any image shows the whole sphere."""
+        return any(self.views)
+
+    def views_of(self, index: int) -> tuple[str, ...]:
+        """The views cut from an image, which is a panorama then; none of any other."""
+        return self.views[index] if self.views else ()
 
     @property
     def stretches(self) -> list[range]:
@@ -70,12 +82,14 @@ def read_source(workspace: Workspace) -> Source:
         files = tuple(str(frame["file"]) for frame in frames)
         times = tuple(_seconds(frame["timestamp_s"]) for frame in frames)
         clips = tuple(int(frame.get("clip", 0)) for frame in frames)
-        source = Source(root, files, times, is_video=True, clips=clips)
+        source = Source(root, files, times, is_video=True, clips=clips, views=_views(frames))
     else:
         capture = json.loads((root / "capture.json").read_text("utf-8"))
         files = tuple(str(image["file"]) for image in capture["images"])
         exif = tuple(image.get("exif", {}) for image in capture["images"])
-        source = Source(root, files, (None,) * len(files), is_video=False, exif=exif)
+        none = (None,) * len(files)
+        views = _views(capture["images"])
+        source = Source(root, files, none, is_video=False, exif=exif, views=views)
     missing = [file for file in source.files if not (root / file).is_file()]
     if not source.files or missing:
         raise CaptureError(
@@ -92,24 +106,35 @@ def read_source(workspace: Workspace) -> Source:
     return source
 
 
+def _views(entries: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple(map(str, entry.get("views", ()))) for entry in entries)
+
+
 def camera_groups(source: Source, lens: str) -> tuple[CameraGroup, ...]:
     """Images that share a lens, each with the COLMAP model to fit and the focal length EXIF gives.
 
     Frames of a clip are one group. Photos are grouped by size and by what EXIF says of camera and
-    focal length. lens: the model wanted; groups of few images get a simpler one than OPENCV.
+    focal length. Panoramas are apart, with a model that has nothing to fit. lens: the model wanted
+    for the others; groups of few images get a simpler one than OPENCV.
     Raises CaptureError (image_undecodable) for a file that is no picture.
     """
     if source.is_video:
-        return tuple(_group(stretch, lens, None) for stretch in source.stretches)
+        return tuple(
+            _group(stretch, PANORAMA if source.views_of(stretch[0]) else lens, None)
+            for stretch in source.stretches
+        )
     members: dict[tuple[Any, ...], list[int]] = {}
     focal_px: dict[tuple[Any, ...], float | None] = {}
     exif = source.exif or ({},) * len(source.files)
     for index, (path, tags) in enumerate(zip(source.paths, exif, strict=True)):
         width, height = _size_of(path)
-        key = (width, height, *(tags.get(name) for name in _LENS_KEYS))
+        model = PANORAMA if source.views_of(index) else lens
+        key: tuple[Any, ...] = (model, width, height)
+        if model != PANORAMA:
+            key = (*key, *(tags.get(name) for name in _LENS_KEYS))
         members.setdefault(key, []).append(index)
-        focal_px[key] = prior_focal_px(tags, width, height)
-    return tuple(_group(indices, lens, focal_px[key]) for key, indices in members.items())
+        focal_px[key] = None if model == PANORAMA else prior_focal_px(tags, width, height)
+    return tuple(_group(indices, key[0], focal_px[key]) for key, indices in members.items())
 
 
 def prior_focal_px(exif: Mapping[str, Any], width: int, height: int) -> float | None:

@@ -3,8 +3,9 @@
 Writes `images/frame_00001.jpg`, ... (upright, SDR, reduced) and `frames.json`: `{width, height,
 num_source_frames, warnings, clips: [{name, offset_s, duration_s, width, height, num_frames,
 num_source_frames}], frames: [{file, clip, timestamp_s, source_frame_index, sharpness}]}`.
-Times of several clips run on from one to the next: `offset_s` is where a clip's own begin.
-Each clip is decoded once; of each window only the best frame so far is held.
+Frames of a 360-degree clip lie in `panoramas/`, and the views cut from each in `images/`: its row
+lists them as `views`. Times of several clips run on from one to the next: `offset_s` is where a
+clip's own begin. Each clip is decoded once; of each window only the best frame so far is held.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from pipelines.captures.archive_rules import shown
 from pipelines.captures.clips import Clip, clip_file
 from pipelines.captures.hdr import TRANSFERS
 from pipelines.captures.minimum import MIN_IMAGES
+from pipelines.captures.panorama_files import FOLDER as PANORAMAS
+from pipelines.captures.panorama_files import write_views
 from pipelines.captures.record import CaptureRecord
 from pipelines.captures.video_frames import (
     DecodePlan,
@@ -33,6 +36,10 @@ from pipelines.options import FramesOptions
 from pipelines.stage import StageContext
 
 FRAMES_JSON = "frames.json"
+PANORAMA_SIZE = 2
+"""Panoramas are so many times as large as other frames: a view of 90 degrees is a third of one."""
+PANORAMA_SHARE = 2
+"""For so many frames that other films would give there is one panorama: it shows four views."""
 MIN_PER_CLIP = 8
 """Frames that a short clip gets beside long ones, as far as it has so many."""
 
@@ -43,7 +50,7 @@ class _Windows:
 
     rows: of all clips so far, to which the clip's are added. clip: its number. offset_s: what its
     times are counted from. num_windows: 0 to keep every frame. start_s, length_s: of a window's
-    grid, by the clip's own times.
+    grid, by the clip's own times. num_views: cut from each frame, which is a panorama then.
     """
 
     out: Path
@@ -54,6 +61,7 @@ class _Windows:
     num_windows: int
     start_s: float
     length_s: float
+    num_views: int = 0
     num_seen: int = 0
     _best: Frame | None = None
     _best_sharpness: float = -1.0
@@ -75,7 +83,8 @@ class _Windows:
         frame = self._best
         if frame is None:
             return
-        file = f"images/frame_{len(self.rows) + 1:05d}.jpg"
+        stem = f"frame_{len(self.rows) + 1:05d}"
+        file = f"{PANORAMAS if self.num_views else 'images'}/{stem}.jpg"
         frame.save(self.out / file, self.jpeg_quality)
         self.rows.append(
             {
@@ -88,6 +97,9 @@ class _Windows:
                 "sharpness": round(self._best_sharpness, 3),
             }
         )
+        if self.num_views:
+            views = write_views(self.out / file, self.out, stem, self.num_views)
+            self.rows[-1]["views"] = views
         self._best, self._best_sharpness = None, -1.0
 
     def _window_of(self, frame: Frame) -> int:
@@ -110,7 +122,8 @@ def run(options: FramesOptions, ctx: StageContext) -> dict[str, Any]:
             code="no_video_stream",
             hint="Skip the stage `frames` for this capture.",
         )
-    (ctx.out / "images").mkdir(parents=True, exist_ok=True)
+    for folder in ("images", *([PANORAMAS] if any(clip.num_views for clip in clips) else [])):
+        (ctx.out / folder).mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
     read: list[_Read] = []
     whole_s = sum(clip.end_s for clip in clips)
@@ -141,10 +154,12 @@ def run(options: FramesOptions, ctx: StageContext) -> dict[str, Any]:
 def shared_frames(clips: Sequence[Clip], wanted: int) -> list[int]:
     """How many frames each clip gives, by its length, MIN_PER_CLIP or all it has at least.
 
-    Their sum is `wanted`, but for what clips have not, and for what the least takes of many clips.
+    Their sum is `wanted`, but for what clips have not, and for what the least takes of many clips;
+    a panorama counts for PANORAMA_SHARE.
     """
-    least = [min(MIN_PER_CLIP, clip.num_frames) for clip in clips]
-    most = [clip.num_frames for clip in clips]
+    worth = [PANORAMA_SHARE if clip.num_views else 1 for clip in clips]
+    most = [clip.num_frames * each for clip, each in zip(clips, worth, strict=True)]
+    least = [min(MIN_PER_CLIP * each, has) for each, has in zip(worth, most, strict=True)]
     shares = [0.0] * len(clips)
     open_, left = set(range(len(clips))), float(wanted)
     while open_:
@@ -163,7 +178,8 @@ def shared_frames(clips: Sequence[Clip], wanted: int) -> list[int]:
         left = max(left, 0.0)
         open_ -= bounded
     ends = [round(sum(shares[: i + 1])) for i in range(len(clips))]
-    return [end - start for start, end in zip([0, *ends], ends, strict=False)]
+    starts = [0, *ends[:-1]]
+    return [(end - start) // w for start, end, w in zip(starts, ends, worth, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -206,7 +222,8 @@ def _read_clip(
 ) -> _Read:
     """Decode a clip and add its best frames to the rows. share: how many."""
     ctx = scale.ctx
-    width, height = reduced_size(clip.video["width"], clip.video["height"], options.long_side_px)
+    long_side_px = options.long_side_px * (PANORAMA_SIZE if clip.num_views else 1)
+    width, height = reduced_size(clip.video["width"], clip.video["height"], long_side_px)
     windows = _Windows(
         out=ctx.out,
         jpeg_quality=options.jpeg_quality,
@@ -216,6 +233,7 @@ def _read_clip(
         num_windows=0 if clip.num_frames <= share else share,
         start_s=clip.start_s,
         length_s=clip.length_s / share,
+        num_views=clip.num_views,
     )
     plan = DecodePlan(
         width=width,

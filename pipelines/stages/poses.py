@@ -1,10 +1,10 @@
 """Poses: where each image was taken, by structure from motion.
 
 Reads the images of `frames` (videos) or `ingest` (photos). Writes cameras.json (registered images
-only, gravity along -Z, cameras in [-1, 1]^3), points.ply (sparse, coloured, same frame) and
-report.json (what registered, what did not and why, every attempt made, which lens and how well it
-is known); where no usable poses are found, report.json alone. The parts: `pipelines.sfm` (which
-images, which pairs, attempts, verdict, lenses), `pipelines.tools.colmap`,
+only, of panoramas their views; gravity along -Z, cameras in [-1, 1]^3), points.ply (sparse,
+coloured, same frame) and report.json (what registered, what did not and why, every attempt made,
+which lens and how well it is known); where no usable poses are found, report.json alone. The parts:
+`pipelines.sfm` (which images, which pairs, attempts, verdict, lenses), `pipelines.tools.colmap`,
 `pipelines.scene.orientation`.
 """
 
@@ -23,10 +23,11 @@ from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.orientation import Normalisation, normalise, opengl_from_opencv
 from pipelines.sfm.attempts import Checkpoint, Ladder
-from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses
+from pipelines.sfm.found_images import FoundImages, found_images
+from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled
 from pipelines.sfm.report import build_report, check_usable, report_of_failure, report_of_model
 from pipelines.sfm.rungs import RUNGS
-from pipelines.sfm.source import Source, read_source
+from pipelines.sfm.source import read_source
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import SparseModel
@@ -74,12 +75,16 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         except (PosesError, ToolError) as error:
             _write_report(ctx, report_of_failure(ladder.outcome, source, options, error))
             raise
-        model, lenses = _settle_lenses(reconstructor, model, options, ctx)
+        if source.has_panoramas:
+            lenses = unsettled(model)
+        else:
+            model, lenses = _settle_lenses(reconstructor, model, options, ctx)
     ctx.progress(0.99, "writing the poses", 1.0)
-    poses = opengl_from_opencv(model.world_from_camera)
+    found = found_images(model, source)
+    poses = opengl_from_opencv(found.world_from_camera)
     world = normalise(poses, orient=options.orientation == "auto")
     notes = {"up_from": world.up_from, "centered_on": world.centered_on}
-    write_cameras(ctx.out / "cameras.json", model, source, world, notes)
+    write_cameras(ctx.out / "cameras.json", found, world, notes)
     write_sparse_points(ctx.out / SPARSE_POINTS, model, world)
     report = {**build_report(outcome, source), **report_of_model(model, lenses, notes)}
     _write_report(ctx, report)
@@ -115,21 +120,23 @@ def _write_report(ctx: StageContext, report: dict[str, Any]) -> None:
 
 
 def write_cameras(
-    path: Path, model: SparseModel, source: Source, world: Normalisation, notes: dict[str, Any]
+    path: Path, found: FoundImages, world: Normalisation, notes: dict[str, Any]
 ) -> None:
     """cameras.json of the registered images, in capture order, in the normalised world."""
-    poses = world.similarity.apply_to_cameras(opengl_from_opencv(model.world_from_camera))
+    poses = world.similarity.apply_to_cameras(opengl_from_opencv(found.world_from_camera))
     images = tuple(
         PosedImage(
-            file=source.files[index],
+            file=file,
             camera=camera,
             world_from_camera=tuple(tuple(float(value) for value in row) for row in pose),
-            timestamp_s=source.timestamps_s[index],
+            timestamp_s=time_s,
         )
-        for index, camera, pose in zip(model.indices, model.camera_of, poses, strict=True)
+        for file, camera, time_s, pose in zip(
+            found.files, found.camera_of, found.timestamps_s, poses, strict=True
+        )
     )
     CamerasFile(
-        cameras=model.cameras, images=images, metric=False, source="colmap", notes=notes
+        cameras=found.cameras, images=images, metric=False, source="colmap", notes=notes
     ).save(path)
 
 

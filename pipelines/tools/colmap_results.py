@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pycolmap
 
 from pipelines.errors import ToolError
+from pipelines.scene import panoramas
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.colmap_lenses import COLMAP_LENSES, lens_from_colmap
 
@@ -90,6 +91,8 @@ def intrinsics_from_colmap(
     model: str, width: int, height: int, params: Sequence[float]
 ) -> Intrinsics:
     """A COLMAP camera as ours. Raises ToolError for a lens model that we cannot express."""
+    if model == panoramas.MODEL:
+        return panoramas.panorama_lens(width, height)
     try:
         return lens_from_colmap(model, width, height, params)
     except ValueError as error:

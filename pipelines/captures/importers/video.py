@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pipelines.captures.panorama_files import EQUIRECTANGULAR
 from pipelines.errors import CaptureError, ToolError
 from pipelines.options import IngestOptions
+from pipelines.scene.panoramas import is_whole
 from pipelines.stage import StageContext
 from pipelines.tools.ffmpeg import VideoInfo, probe, run_ffmpeg, untrusted_input
 
@@ -118,7 +120,7 @@ def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int
     ctx.progress(0.0, "Reading the video's index")
     info = probe(path)
     _check_size(info, options)
-    _check_projection(info)
+    info = _with_projection(info, options)
     ctx.progress(0.1, "Looking for the end of the video")
     try:
         packets = scan(path, ctx)
@@ -157,14 +159,24 @@ def _check_size(info: VideoInfo, options: IngestOptions) -> None:
         )
 
 
-def _check_projection(info: VideoInfo) -> None:
-    if info.projection:
+def _with_projection(info: VideoInfo, options: IngestOptions) -> VideoInfo:
+    """The video with the projection that counts: what it says, or what the options say."""
+    projection = {"auto": info.projection, "flat": ""}.get(options.projection, options.projection)
+    if projection not in ("", EQUIRECTANGULAR):
         raise CaptureError(
-            f"The video is a 360-degree one ({info.projection}); only plain views can be used.",
+            f"The video is a 360-degree one of a kind that is not read ({projection}).",
             code="projection_unsupported",
-            hint="Export plain (flat, perspective) clips from the camera's app, or film with a "
-            "phone.",
+            hint="Export it from the camera's app as an equirectangular video (twice as wide as "
+            "high), or as plain (flat, perspective) clips.",
         )
+    if projection and not is_whole(info.width, info.height):
+        raise CaptureError(
+            f"The video is said to show the whole sphere, and is {info.width}x{info.height} "
+            "instead of twice as wide as high: half a sphere, or two pictures for two eyes.",
+            code="projection_unsupported",
+            hint="Export the whole sphere for one eye, or set ingest.projection to flat.",
+        )
+    return replace(info, projection=projection)
 
 
 def _details(info: VideoInfo, packets: Scan) -> dict[str, object]:
@@ -179,6 +191,7 @@ def _details(info: VideoInfo, packets: Scan) -> dict[str, object]:
         "codec": info.codec,
         "rotation_deg": info.rotation_deg,
         "hdr": info.hdr,
+        "projection": info.projection,
         "variable_frame_rate": variable,
         "start_s": round(packets.times_s[0], 6),
     }
@@ -188,10 +201,12 @@ def _warnings(info: VideoInfo) -> list[str]:
     warnings = []
     if max(info.width, info.height) < 480:
         warnings.append(f"The video is small ({info.width}x{info.height}): details will be few.")
-    if info.width == 2 * info.height and info.width >= _PANORAMA_PX:
+    is_wide = info.width == 2 * info.height and info.width >= _PANORAMA_PX
+    if is_wide and not info.projection:
         warnings.append(
-            "The video is twice as wide as high, as 360-degree videos are. If it is one, its poses "
-            "will be wrong: export plain (flat) clips from the camera's app."
+            "The video is twice as wide as high, as 360-degree videos are, and does not say that "
+            "it is one. If it is, its poses will be wrong: set ingest.projection to "
+            "equirectangular."
         )
     if info.hdr == "dolby":
         warnings.append("The video is Dolby Vision without a compatible layer: colours may be off.")

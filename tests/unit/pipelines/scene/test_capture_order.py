@@ -21,3 +21,12 @@ def test_photos_named_at_random_are_ordered_by_neighbourhood() -> None:
     shuffled = np.random.default_rng(3).permutation(60)
     order = shuffled[capture_order(poses[shuffled], [f"{i}.jpg" for i in range(60)], [None] * 60)]
     assert order.tolist() in (list(range(60)), list(range(59, -1, -1)))
+
+
+def test_of_the_views_of_a_panorama_the_first_is_in_the_order() -> None:
+    """Else a flight along the capture would look four ways in turn."""
+    poses = np.repeat(arc(12), 4, axis=0)
+    names = [f"frame_{i:02d}_{view}.jpg" for i in range(12) for view in (1, 2, 3, 4)]
+    times = [i / 10 for i in range(12) for _ in range(4)]
+    assert capture_order(poses, names, times).tolist() == list(range(0, 48, 4))
+    assert capture_order(poses, names, [None] * 48).tolist() == list(range(0, 48, 4))

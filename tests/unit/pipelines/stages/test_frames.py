@@ -206,12 +206,40 @@ def test_clips_that_name_no_matrix_have_that_of_their_size(
     assert np.abs(color - [255, 0, 0]).max() < 5, color
 
 
-def test_a_video_that_says_it_is_spherical_is_refused(tmp_path: Path) -> None:
-    clip = make_clip(tmp_path / "a.mp4", "testsrc2=s=640x320:r=30:d=0.5")
-    with pytest.raises(CaptureError, match="360-degree") as caught:
-        ingested(tmp_path, spherical(clip))
+def test_a_video_that_says_it_is_spherical_gives_panoramas_and_their_views(tmp_path: Path) -> None:
+    clip = spherical(make_clip(tmp_path / "a.mp4", "testsrc2=s=640x320:r=30:d=0.5"))
+    summary = ingested(tmp_path, clip, IngestOptions(panorama_views=6))
+    assert summary["projection"] == "equirectangular"
+    ctx = context(tmp_path / "job", "frames")
+    summary = frames.run(FramesOptions(num_frames=16, long_side_px=160), ctx)
+    assert (summary["num_frames"], summary["width"], summary["height"]) == (8, 320, 160)
+    rows = json.loads((ctx.out / "frames.json").read_text())["frames"]
+    assert [row["file"] for row in rows[:2]] == [f"panoramas/frame_0000{n}.jpg" for n in (1, 2)]
+    assert rows[7]["views"] == [f"images/frame_00008_{n}.jpg" for n in range(1, 7)]
+    assert len(list((ctx.out / "images").iterdir())) == 48
+    assert len(list((ctx.out / "panoramas").iterdir())) == 8
+
+
+@pytest.mark.parametrize("size", ["640x640", "640x360"])
+def test_what_is_no_whole_sphere_for_one_eye_is_refused(tmp_path: Path, size: str) -> None:
+    clip = spherical(make_clip(tmp_path / "a.mp4", f"testsrc2=s={size}:r=30:d=0.5"))
+    with pytest.raises(CaptureError, match="twice as wide as high") as caught:
+        ingested(tmp_path, clip)
     assert caught.value.code == "projection_unsupported"
-    assert "flat" in caught.value.hint
+    assert "ingest.projection" in caught.value.hint
+
+
+def test_the_option_overrules_what_a_video_says_of_its_projection(tmp_path: Path) -> None:
+    for name, make, wanted, found in (
+        ("flat", spherical, "flat", ""),
+        ("told", lambda clip: clip, "equirectangular", "equirectangular"),
+        ("plain", lambda clip: clip, "auto", ""),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        clip = make(make_clip(folder / "a.mp4", "testsrc2=s=640x320:r=30:d=0.5"))
+        summary = ingested(folder, clip, IngestOptions.model_validate({"projection": wanted}))
+        assert summary["projection"] == found
 
 
 @pytest.mark.parametrize(("size", "warned"), [("2048x1024", True), ("1920x1080", False)])
