@@ -12,7 +12,7 @@ from api.errors import responses
 from api.exports import service
 from api.exports.schemas import ExportKindList, ExportRequest
 from api.idempotency import IdempotencyKey, Once
-from api.ids import JobId
+from api.ids import JobId, LabelFilter
 from api.jobs.endpoints import LINKS, POLL_S
 from api.jobs.schemas import JobPage, JobState, JobSummary, JobView
 from storage import queries
@@ -53,6 +53,7 @@ def list_exports(
     job_id: JobId,
     services: ServicesDep,
     state: Annotated[JobState | None, Query()] = None,
+    label: Annotated[LabelFilter | None, Query(description="KEY (has it) or KEY=VALUE.")] = None,
     limit: Annotated[int, Query(ge=1, le=100)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> JobPage:
@@ -60,7 +61,7 @@ def list_exports(
     with services.database.read_scope() as session:
         queries.get_job(session, job_id)
         found, following = queries.list_jobs(
-            session, state=state, limit=limit, cursor=cursor, exports_of=job_id
+            session, state=state, label=label, limit=limit, cursor=cursor, exports_of=job_id
         )
         return JobPage(items=[JobSummary.of(job) for job in found], next_cursor=following)
 

@@ -131,6 +131,10 @@ def test_several_wait_at_once_and_are_listed_with_their_job_alone(
     service.http.post(f"/v1/jobs/{made[1]}/cancel")
     queued = service.http.get(f"/v1/jobs/{job}/exports", params={"state": "queued"}).json()
     assert [item["id"] for item in queued["items"]] == [made[2], made[0]]
+    path = f"/v1/jobs/{job}/exports"
+    labelled = export(service, job, "cameras", labels={"for": "me"})["id"]
+    found = service.http.get(path, params={"label": "for=me"}).json()["items"]
+    assert [item["id"] for item in found] == [labelled]
     listed = service.http.get("/v1/jobs").json()["items"]
     assert [item["id"] for item in listed] == [job]
     problem(service.http.get(f"/v1/jobs/{'0' * 28}/exports"), 404, "job_not_found")
