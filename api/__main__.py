@@ -10,12 +10,14 @@ import uvicorn
 
 from api.app import create_app
 from api.settings import ApiSettings
+from storage.memory_privacy import close_memory
 
 GRACE_S = 5
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Serve until SIGINT or SIGTERM."""
+    close_memory()
     settings = ApiSettings()
     parser = argparse.ArgumentParser(prog="python -m api", description=__doc__)
     parser.add_argument("--host", default=settings.host, help="address to listen on")

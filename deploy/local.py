@@ -20,6 +20,7 @@ from typing import IO
 
 from deploy.embedded import Embedded, default_home, port_is_free, write_private
 from deploy.supervisor import StartFailed
+from storage.memory_privacy import close_memory
 
 
 def take_lock(home: Path) -> IO[str] | None:
@@ -70,6 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+    close_memory()
     service_file = home / "service.json"
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

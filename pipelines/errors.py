@@ -98,7 +98,9 @@ class ToolError(PipelineError):
 
 
 class ResourceError(PipelineError):
-    """The machine ran out of something. Codes in use: disk_full, out_of_memory."""
+    """The machine ran out of something. Codes in use: disk_full, out_of_memory,
+    and where a bound of the worker was reached file_too_large, too_many_files,
+    too_many_processes."""
 
     code = "resources_exhausted"
     retryable = True

@@ -38,6 +38,12 @@ CAPTURE_INPUT = "input"
 
 _PACKAGES = ("nerfworks", "torch", "numpy", "pillow", "pycolmap", "open3d", "open3d-cpu", "numba")
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+_BOUNDS = {
+    errno.EFBIG: ("file_too_large", "a larger file"),
+    errno.EMFILE: ("too_many_files", "more open files"),
+    errno.EAGAIN: ("too_many_processes", "more processes"),
+}
+"""What a system says where a process has reached a bound: see worker/containment/limits.py."""
 
 
 def _ignore_progress(fraction: float, message: str, eta_s: float | None) -> None:
@@ -180,8 +186,9 @@ def run_stage(
     Returns the manifest; in its timings `wall_s` is the whole without hashing and publishing, of
     which `load_s` went into hashing inputs and importing the stage's code, and `compile_s` into
     compiling kernels. A worker adds what lies around (`worker.runner`).
-    Raises what the stage raises; a full disk and a lack of memory become
-    ResourceError (disk_full, out_of_memory). What a failed stage wrote is removed, but for its
+    Raises what the stage raises; a full disk, a lack of memory and a bound of the worker become
+    ResourceError (disk_full, out_of_memory, file_too_large, too_many_files, too_many_processes).
+    What a failed stage wrote is removed, but for its
     report.json, which `workspace.failed(name)` keeps; its checkpoint stays, too. A stage that
     succeeds has no checkpoint any more.
     """
@@ -273,6 +280,15 @@ def _translated(stage: Stage) -> Iterator[None]:
                 f"The disk was full during {stage.name}.",
                 code="disk_full",
                 hint="Free some space where jobs are kept, and try again.",
+            ) from error
+        if error.errno == errno.ENOMEM:
+            raise _out_of_memory(stage) from error
+        if error.errno in _BOUNDS:
+            code, what = _BOUNDS[error.errno]
+            raise ResourceError(
+                f"{stage.name} wanted {what} than it may have.",
+                code=code,
+                hint="Use fewer or smaller images, or have the bound of the worker raised.",
             ) from error
         raise
     except RuntimeError as error:

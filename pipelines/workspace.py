@@ -18,6 +18,7 @@ JOB/
   <stage>/manifest.json     written last: a folder with a manifest is complete
   .partial/<stage>/         what a running stage writes
   .checkpoint/<stage>/      what outlives a failed attempt
+  .temporary/<stage>/       what a running stage's libraries put aside; gone when it ends
   .failed/<stage>/          report.json, where a stage that failed wrote one
 """
 
@@ -59,6 +60,10 @@ class Workspace:
     def checkpoint(self, name: str) -> Path:
         """What outlives a failed attempt of a stage."""
         return self.root / ".checkpoint" / name
+
+    def temporary(self, name: str) -> Path:
+        """Where temporary files of a running stage go, in a worker."""
+        return self.root / ".temporary" / name
 
     def failed(self, name: str) -> Path:
         """What a stage that failed left behind to explain it."""

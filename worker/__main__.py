@@ -17,13 +17,15 @@ from typing import Any
 
 from celery.signals import worker_ready, worker_shutting_down
 
+from storage.memory_privacy import close_memory
 from storage.queue import QUEUES
 from storage.schema import upgrade
 from storage.settings import StorageSettings
 from worker.app import make_app
 from worker.consumer import ConsumerLink
+from worker.cores import num_cores
 from worker.housekeeping import detect_gpu
-from worker.runtime import WorkerIdentity, WorkerRuntime, num_cores, set_current_runtime
+from worker.runtime import WorkerIdentity, WorkerRuntime, set_current_runtime
 from worker.settings import WorkerSettings
 
 EXIT_LIMIT_S = 20.0
@@ -89,6 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
         stream=sys.stderr,
         format="%(asctime)s %(levelname)s %(name)s: %(message)s",
     )
+    close_memory()
     storage = StorageSettings()
     upgrade(storage.resolved_database_url)  # whoever starts first makes the schema
     link = ConsumerLink()

@@ -10,12 +10,14 @@ from __future__ import annotations
 import logging
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from pipelines.workspace import Workspace
 from storage import keys
 from storage.claims import Claim
 from storage.db import Database
@@ -45,6 +47,18 @@ class Snapshot:
             [stats[name].st_size, stats[name].st_mtime_ns] == noted
             for name, noted in self.files.items()
         )
+
+
+def snapshot_of(workspace: Workspace, stage: str, message: Mapping[str, Any]) -> Snapshot:
+    """What a stage process says that it holds.
+
+    Raises ValueError where that is not beside its checkpoint: nobody uploads what lies elsewhere.
+    """
+    folder = Path(message["path"])
+    checkpoint = workspace.checkpoint(stage)
+    if folder.parent != checkpoint.parent or not folder.name.startswith(f"{stage}.saved-"):
+        raise ValueError(f"{stage} offers a checkpoint that is none of its own")
+    return Snapshot(folder, message["files"])
 
 
 class CheckpointUploader:

@@ -50,18 +50,42 @@ class StageCrashedError(Exception):
         self.exit_code = exit_code
 
 
+def _out_of_memory(stage: str) -> dict[str, Any]:
+    return ResourceError(
+        f"Memory ran out during {stage}: the system stopped it.",
+        code="out_of_memory",
+        hint="Use a smaller preset, or fewer or smaller images, or a larger machine.",
+    ).as_dict()
+
+
+def failed_of(
+    stage: str, error: dict[str, Any], memory_ran_out: bool
+) -> StageCrashedError | StageFailedError:
+    """What a stage's own error means. memory_ran_out: the kernel killed something for it meanwhile.
+
+    A program that a stage started and the kernel killed for memory is the stage's lack of memory.
+    """
+    if error["code"] == "out_of_memory":
+        return StageCrashedError("out_of_memory", error)
+    if memory_ran_out and (error.get("details") or {}).get("exit_code") == -signal.SIGKILL:
+        return StageCrashedError("out_of_memory", _out_of_memory(stage))
+    return StageFailedError(error)
+
+
 def crash_of(stage: str, status: int, out_of_memory: bool) -> StageCrashedError:
     """What an exit status of the stage's process means.
 
     status: as subprocess gives it, negative for a signal.
     """
     if out_of_memory:
-        error = ResourceError(
-            f"Memory ran out during {stage}: the system stopped it.",
-            code="out_of_memory",
-            hint="Use a smaller preset, or fewer or smaller images, or a larger machine.",
+        return StageCrashedError("out_of_memory", _out_of_memory(stage), status)
+    if status == -signal.SIGXCPU:
+        spent = PipelineError(
+            f"The stage {stage} used all the processor time that it may.",
+            code="time_limit",
+            hint="Use a smaller preset, or a faster machine.",
         )
-        return StageCrashedError("out_of_memory", error.as_dict(), status)
+        return StageCrashedError("time_limit", spent.as_dict(), status)
     if status in (-signal.SIGKILL, 128 + signal.SIGKILL, -signal.SIGTERM):
         error = ResourceError(
             f"The process that ran {stage} was killed from outside.",

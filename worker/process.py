@@ -7,37 +7,24 @@ import json
 import logging
 import os
 import queue
-import re
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from worker.containment.apply import Containment
+from worker.containment.plan import Plan
+from worker.leftovers import end_group
 from worker.stage_process import END_OF_LOG
 
 _log = logging.getLogger("nerfworks.worker")
-_SECRET_NAME = re.compile(
-    r"^(AWS|AZURE|GOOGLE|GCP|GCLOUD|S3|CELERY|PG)_?"
-    r"|^NERFWORKS_(?!HOME$|REGISTRY$|LPIPS_(WEIGHTS|SHA256)$)"
-    r"|SECRET|PASSWORD|TOKEN|CREDENTIAL|API_?KEY|ACCESS_?KEY|DATABASE_URL|REDIS_URL"
-)
 _LINE_BYTES = 8_192
 _EXIT_WAIT_S = 5.0
-
-
-def scrubbed_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment of a stage process: without keys and addresses of the service."""
-    kept = {name: value for name, value in environment.items() if not _SECRET_NAME.search(name)}
-    root = str(Path(__file__).resolve().parent.parent)
-    paths = [root, *filter(None, kept.get("PYTHONPATH", "").split(os.pathsep))]
-    kept["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
-    kept["PYTHONUNBUFFERED"] = "1"
-    # OpenMP's waiting threads must not spin: see pipelines/__main__.py for what that costs.
-    kept.setdefault("OMP_WAIT_POLICY", "passive")
-    return kept
+_NO_MEMORY = ("std::bad_alloc", "Cannot allocate memory", "MemoryError", "out of memory")
+_said: list[str] = []  # how stages are contained, as the log was told
 
 
 def oom_kills() -> int:
@@ -55,16 +42,18 @@ def oom_kills() -> int:
 class StageProcess:
     """A warm child. One run at a time; not safe for several threads at once.
 
-    registry: dotted name of the stages' registry. preload: names of
+    registry: dotted name of the stages' registry. plan: what it may touch. preload: names of
     stages whose code it loads while it is idle.
     messages: what the child sent, ending with {"type": "exit"} when it is gone.
     """
 
-    def __init__(self, registry: str, preload: Sequence[str] = ()) -> None:
+    def __init__(self, registry: str, plan: Plan, preload: Sequence[str] = ()) -> None:
         self.messages: queue.Queue[dict[str, Any]] = queue.Queue()
         self._on_line: Callable[[str], None] = lambda line: None
         self._log_ended = threading.Event()
         self._run_id = ""
+        self._guardian: int | None = None
+        self._wanted_memory = False  # its last lines said that there was none
         self._oom_before = oom_kills()
         message_read, message_write = os.pipe()
         life_read, self._life_write = os.pipe()
@@ -73,14 +62,14 @@ class StageProcess:
                 [
                     *(sys.executable, "-m", "worker.stage_process"),
                     *("--message-fd", str(message_write), "--life-fd", str(life_read)),
-                    *("--registry", registry, "--preload", *preload),
+                    *("--plan", plan.to_json(), "--registry", registry, "--preload", *preload),
                 ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 pass_fds=(message_write, life_read),
                 start_new_session=True,
-                env=scrubbed_environment(os.environ),
+                env=dict(plan.environment),
             )
         finally:
             os.close(message_write)
@@ -111,14 +100,25 @@ class StageProcess:
         return None
 
     def exit_reason(self) -> tuple[int, bool]:
-        """(exit status, negative for a signal; whether memory ran out). Only after the exit."""
+        """(exit status, negative for a signal; whether memory ran out). Only after the exit.
+
+        It ran out where the kernel killed for it, or where the process broke down, as native code
+        does, right after it had said that it got none.
+        """
         status = self._process.wait(_EXIT_WAIT_S)
         killed = status in (-signal.SIGKILL, 128 + signal.SIGKILL)
-        return status, killed and oom_kills() > self._oom_before
+        if killed:
+            return status, self.memory_ran_out()
+        return status, status < 0 and self._wanted_memory
+
+    def memory_ran_out(self) -> bool:
+        """Whether the kernel killed something for memory since the run began."""
+        return oom_kills() > self._oom_before
 
     def start_run(self, run_id: str, on_line: Callable[[str], None], **command: Any) -> None:
         """Start a run. Raises BrokenPipeError where the child is gone."""
         self._run_id, self._on_line = run_id, on_line
+        self._oom_before, self._wanted_memory = oom_kills(), False
         self._log_ended.clear()
         self._send({"do": "run", "run_id": run_id, **command})
 
@@ -134,6 +134,12 @@ class StageProcess:
         """Wait until the last line of the run has arrived."""
         self._log_ended.wait(timeout_s)
         self._on_line = lambda line: None
+
+    def end_leftovers(self) -> int:
+        """Kill what the last run started and left behind; how many."""
+        if self._guardian is None:
+            return 0  # it never got so far as to run anything
+        return end_group(self.pid, spare={self.pid, self._guardian})
 
     def kill(self) -> None:
         """Kill the child and its group, and wait until it is gone."""
@@ -166,11 +172,27 @@ class StageProcess:
         with os.fdopen(descriptor, encoding="utf-8") as file:
             for line in file:
                 try:
-                    self.messages.put(json.loads(line))
+                    message = json.loads(line)
                 except ValueError:
                     break  # cut off by the child's death
+                if message["type"] == "hello":
+                    self._greet(message)
+                else:
+                    self.messages.put(message)
         self._log_ended.set()
         self.messages.put({"type": "exit"})
+
+    def _greet(self, message: dict[str, Any]) -> None:
+        """Take note of what the child says of itself; the log hears it once."""
+        self._guardian = message["guardian"]
+        contained = Containment(**message["contained"])
+        if (text := contained.as_text()) not in _said:
+            _said.append(text)
+            _log.log(
+                logging.WARNING if contained.lacks else logging.INFO,
+                "stages are contained by: %s",
+                text,
+            )
 
     def _read_log(self) -> None:
         assert self._process.stdout is not None
@@ -181,5 +203,6 @@ class StageProcess:
                     if line.removeprefix(END_OF_LOG) == self._run_id:
                         self._log_ended.set()
                 elif line:
+                    self._wanted_memory |= any(sign in line for sign in _NO_MEMORY)
                     # A progress bar redraws one line with carriage returns: keep its last state.
                     self._on_line(line.rpartition("\r")[2])

@@ -11,9 +11,10 @@ import importlib
 import logging
 import os
 import queue
+import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -38,7 +39,9 @@ from storage.objects import ObjectStore
 from storage.queries import StageWork, stage_work
 from storage.runs import RunEnd
 from storage.steps import reached
-from worker.checkpoints import CheckpointUploader, Snapshot
+from worker.checkpoints import CheckpointUploader, snapshot_of
+from worker.containment.plan import Plan
+from worker.cores import num_cores
 from worker.disk import free_bytes
 from worker.failures import publish_failure
 from worker.laps import Laps
@@ -49,6 +52,7 @@ from worker.outcomes import (
     UnknownOutcomeError,
     crash_of,
     disk_too_small,
+    failed_of,
     failure_of,
     gave_up_of,
     is_away,
@@ -58,6 +62,7 @@ from worker.outcomes import (
 from worker.predecessors import end_predecessor
 from worker.process import StageProcess
 from worker.progress import LeaseKeeper
+from worker.pulse import Pulse
 from worker.settings import WorkerSettings
 from worker.store_watch import StoreWatch
 from worker.transfer import (
@@ -74,7 +79,6 @@ MESSAGE_STEP_S = 0.25
 LOG_END_S = 2.0
 CHECKPOINT_END_S = 120.0
 RECORD_STEP_S = 1.0
-LOOK_S = 1.0
 Result = TypeVar("Result")
 
 
@@ -92,48 +96,12 @@ def load_registry(name: str) -> Registry:
     return module
 
 
-class Pulse:
-    """For how long a stage has shown no sign of life: progress that moved, a line, a checkpoint.
-
-    It grows only while somebody watches: a worker that was frozen, or asleep with its machine, does
-    not take its own silence for the stage's.
-    """
-
-    def __init__(self) -> None:
-        self._silent_s = 0.0
-        self._looked_at = time.monotonic()
-        self._said: tuple[Any, ...] = ()
-
-    def beat(self) -> None:
-        """There was a sign."""
-        self._silent_s = 0.0
-
-    def notice(self, message: Mapping[str, Any]) -> bool:
-        """A message of the stage process came. Whether it is a sign: progress said before is not.
-
-        Seconds left that run down are none either.
-        """
-        if message["type"] == "progress":
-            said = (message["fraction"], message["message"])
-            if said == self._said:
-                return False
-            self._said = said
-        self.beat()
-        return True
-
-    def silent_s(self, moment: float | None = None) -> float:
-        """Seconds without a sign so far. To be asked often."""
-        moment = time.monotonic() if moment is None else moment
-        self._silent_s += min(moment - self._looked_at, LOOK_S)
-        self._looked_at = moment
-        return self._silent_s
-
-
 class Runner:
     """Runs attempts for one slot, in one warm process that is replaced when it dies.
 
-    registry: dotted name of the stages' registry. threads: says how many the numeric libraries of a
-    stage that starts now may use, where the environment's OMP_NUM_THREADS does not.
+    registry: dotted name of the stages' registry. plan: what its process may touch.
+    threads: says how many the numeric libraries of a stage that starts now may use, where the
+    environment's OMP_NUM_THREADS does not.
     shutdown: set when the worker ends; a running attempt then gives its stage back. store_watch:
     the worker's; an attempt that it explains does so, too.
     """
@@ -146,6 +114,7 @@ class Runner:
         *,
         work_dir: Path,
         registry: str,
+        plan: Plan,
         threads: Callable[[], int],
         shutdown: threading.Event,
         store_watch: StoreWatch | None = None,
@@ -156,6 +125,7 @@ class Runner:
         self._work_dir = work_dir
         self._registry_name = registry
         self._registry = load_registry(registry)
+        self._plan = plan
         self._threads = threads
         self._shutdown = shutdown
         self._store_watch = store_watch or StoreWatch(store)
@@ -286,7 +256,7 @@ class Runner:
     def _ensure_process(self) -> StageProcess:
         if self._process is None or not self._process.is_alive():
             self.close()
-            self._process = StageProcess(self._registry_name, self._preload)
+            self._process = StageProcess(self._registry_name, self._plan, self._preload)
         return self._process
 
     def _run_in_process(
@@ -300,6 +270,7 @@ class Runner:
         laps: Laps,
     ) -> dict[str, Any]:
         process, pulse = self._ensure_process(), Pulse()
+        temporary = workspace.temporary(stage.name)
 
         def on_line(line: str) -> None:
             pulse.beat()
@@ -316,8 +287,10 @@ class Runner:
                 root=str(workspace.root),
                 seed=work.seed,
                 threads=int(os.environ.get("OMP_NUM_THREADS") or self._threads()),
+                cpu_s=stage.time_limit_s * num_cores(),
+                temporary=str(temporary),
             )
-            return self._follow(process, stage, keeper, uploader, laps, pulse)
+            return self._follow(process, stage, keeper, workspace, uploader, laps, pulse)
         except BrokenPipeError:
             raise crash_of(stage.name, *process.exit_reason()) from None
         except StageCrashedError:
@@ -329,14 +302,18 @@ class Runner:
             raise
         finally:
             process.finish_log(LOG_END_S if process.is_alive() else 0.0)
+            if left := process.end_leftovers():
+                _log.warning("%s: ended %d processes that it left", claim.stage_id, left)
             if not process.is_alive():
                 self.close()
+            shutil.rmtree(temporary, ignore_errors=True)
 
     def _follow(
         self,
         process: StageProcess,
         stage: Stage,
         keeper: LeaseKeeper,
+        workspace: Workspace,
         uploader: CheckpointUploader,
         laps: Laps,
         pulse: Pulse,
@@ -348,7 +325,7 @@ class Runner:
             try:
                 guard()
             except StopRunError as stop:
-                self._stop(process, stop.reason, uploader)
+                self._stop(process, stop.reason, workspace, stage, uploader)
                 raise
             if time.monotonic() > deadline:
                 process.kill()
@@ -364,7 +341,7 @@ class Runner:
                     message["fraction"], message["message"], message["eta_s"], moved=is_sign
                 )
             elif kind == "checkpoint":
-                uploader.offer(Snapshot(Path(message["path"]), message["files"]))
+                uploader.offer(snapshot_of(workspace, stage.name, message))
             elif kind == "begun":
                 laps.end("start_s")
                 reached("run.begun")
@@ -373,9 +350,7 @@ class Runner:
                 manifest: dict[str, Any] = message["manifest"]
                 return manifest
             elif kind == "failed":
-                if message["error"]["code"] == "out_of_memory":
-                    raise StageCrashedError("out_of_memory", message["error"])
-                raise StageFailedError(message["error"])
+                raise failed_of(stage.name, message["error"], process.memory_ran_out())
             elif kind == "cancelled":
                 raise gave_up_of(stage.name)  # where we had asked, `_stop` took the message
             elif kind == "exit":
@@ -393,7 +368,14 @@ class Runner:
             return {}, False
         return message, pulse.notice(message)
 
-    def _stop(self, process: StageProcess, reason: str, uploader: CheckpointUploader) -> None:
+    def _stop(
+        self,
+        process: StageProcess,
+        reason: str,
+        workspace: Workspace,
+        stage: Stage,
+        uploader: CheckpointUploader,
+    ) -> None:
         """Ask the stage to stop; kill it, and what it started, where it does not in time.
 
         A checkpoint that it still saves is kept where the uploader's guard lets it.
@@ -406,7 +388,7 @@ class Runner:
             except queue.Empty:
                 break
             if message["type"] == "checkpoint":
-                uploader.offer(Snapshot(Path(message["path"]), message["files"]))
+                uploader.offer(snapshot_of(workspace, stage.name, message))
             elif message["type"] in ("done", "failed", "cancelled", "exit"):
                 return
         self.close()

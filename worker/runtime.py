@@ -37,7 +37,10 @@ from storage.records import (
     worker_seen_lately,
 )
 from storage.settings import StorageSettings
-from worker.compiling import KernelCompiler
+from worker.compiling import KernelCompiler, compile_sources
+from worker.containment.environment import CODE_ROOT
+from worker.containment.planning import check_plan, make_plan
+from worker.cores import num_cores
 from worker.disk import DiskWatch
 from worker.housekeeping import Housekeeping
 from worker.locks import is_process
@@ -82,13 +85,6 @@ def is_alive(other: Worker) -> bool:
     return other.pid != os.getpid() and is_process(other.pid)
 
 
-def num_cores() -> int:
-    """Processors that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 @dataclass(frozen=True)
 class _Taken:
     """A claim, and whether it holds the worker's GPU."""
@@ -121,7 +117,8 @@ class WorkerRuntime:
         self._free: queue.SimpleQueue[Runner] = queue.SimpleQueue()
         self._gpu = threading.Lock()  # held by the slot whose stage runs on the GPU
         self._stages = load_registry(registry).STAGES
-        self._compiler = KernelCompiler()
+        self._plan = plan = make_plan(storage, settings, os.environ, has_gpu=identity.has_gpu)
+        self._compiler = KernelCompiler(plan)
         self._disk = DiskWatch(storage.work_dir, settings.min_free_bytes)
         self._store_watch = StoreWatch(self._store)
         self._runners = [
@@ -131,6 +128,7 @@ class WorkerRuntime:
                 settings,
                 work_dir=storage.work_dir,
                 registry=registry,
+                plan=plan,
                 threads=self._threads_now,
                 shutdown=self.shutdown,
                 store_watch=self._store_watch,
@@ -150,7 +148,11 @@ class WorkerRuntime:
         )
 
     def start(self) -> None:
-        """Free what this worker's former self held, and start to keep house."""
+        """Free what this worker's former self held, and start to keep house.
+
+        Raises ContainmentError where stages must be contained and cannot be.
+        """
+        check_plan(self._plan)
         freed = self._enlist()
         if freed:
             _log.warning("a former self of this worker left: %s", ", ".join(freed))
@@ -202,6 +204,7 @@ class WorkerRuntime:
             for stage in self._stages
             if queue_for(resource_of(stage.needs_gpu), gpu_is_live) in self.identity.queues
         ]
+        compile_sources(CODE_ROOT)
         for runner in self._runners:
             runner.prepare([stage.name for stage in mine])
         trains = any(stage.run.startswith("pipelines.stages.train:") for stage in mine)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
@@ -45,4 +47,34 @@ class WorkerSettings(BaseSettings):
         True,
         description="Start stage processes, load their code and compile kernels before a job "
         "comes; without it an idle worker takes less memory, and its first job longer.",
+    )
+
+    contain: Literal["auto", "required", "off"] = Field(
+        "auto",
+        description="Confine stage processes as far as the system can; or refuse to run any where "
+        "it cannot do it all; or not at all.",
+    )
+    stage_memory_bytes: int | None = Field(
+        None,
+        ge=0,
+        description="Memory that one process of a stage may hold; 0 for no bound. Without it 95 % "
+        "of the machine's, or the container's; on a GPU none.",
+    )
+    stage_file_bytes: int = Field(
+        2**36, ge=0, description="Largest file that a stage may write; 0 for no bound."
+    )
+    stage_processes: int = Field(
+        4096, ge=64, description="Processes and threads that stages may start; root has no bound."
+    )
+    stage_open_files: int = Field(
+        4096, ge=64, description="Files that one process of a stage may have open."
+    )
+    stage_environment: str = Field(
+        "", description="Further environment variables that stages get: names between commas."
+    )
+    stage_readable: str = Field(
+        "", description="Further files and folders that stages may read, as PATH lists them."
+    )
+    stage_writable: str = Field(
+        "", description="Further folders that stages may write to, as PATH lists them."
     )

@@ -3,9 +3,11 @@
 It reads commands as JSON lines from stdin and writes messages as JSON lines to a descriptor of its
 own; what stages print to stdout and stderr are log lines.
 
-    commands:  {"do": "run", "stage", "options", "root", "seed", "threads", "run_id"}
+    commands:  {"do": "run", "stage", "options", "root", "seed", "threads", "cpu_s", "temporary",
+                "token", "run_id"}
                {"do": "stop", "run_id", "reason"}, reason "cancel", "lost" or "shutdown"
-    messages:  {"type": "hello", "pid"} | {"type": "begun"}, the first of a run
+    messages:  {"type": "hello", "pid", "guardian", "contained"}, the first of all
+               {"type": "begun"}, the first of a run
                {"type": "progress", "fraction", "message", "eta_s"}
                {"type": "checkpoint", "path", "files": {name: [bytes, mtime_ns]}}
                {"type": "done", "manifest"} | {"type": "failed", "error"} | {"type": "cancelled"}
@@ -15,6 +17,9 @@ It never outlives its worker. A guardian, forked before anything heavy is loaded
 of a pipe that only the worker holds open, and then kills the whole process group: also where the
 main thread sits in a long native call and no Python thread can run, and with it the programs that
 a stage started. When the stage process itself ends, the guardian kills what it left behind.
+
+Right after that it confines itself (`worker.containment`): nothing that it loads or runs can reach
+the worker's keys, the database, or the network. The guardian stays outside.
 
 While nothing is asked of it, it loads the code of the stages that it may be given
 (`worker.preloading`), piece by piece; a command waits for one piece at most.
@@ -36,15 +41,20 @@ import select
 import shutil
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from pipelines.errors import Cancelled, PipelineError, ResourceError
 from pipelines.manifest import RunHooks, run_stage
 from pipelines.workspace import Workspace
+from worker.containment.apply import apply_plan
+from worker.containment.limits import allow_cpu_seconds
+from worker.containment.plan import Plan
 from worker.locks import FolderInUseError, folder_lock
 from worker.outcomes import folder_in_use
 from worker.predecessors import holder_note, run_lock
@@ -58,17 +68,18 @@ OOM_SCORE = 500
 INTERNAL_HINT = "This is a fault of the service: see the job's logs for the step that failed."
 
 
-def kill_group() -> None:
+def kill_group() -> NoReturn:
     """End this process, its guardian and all that a stage started."""
     os.killpg(os.getpgrp(), signal.SIGKILL)
+    os._exit(1)
 
 
-def start_guardian(life_fd: int, message_fd: int) -> None:
-    """Fork the process that kills the group when the worker, or this process, is gone."""
+def start_guardian(life_fd: int, message_fd: int) -> int:
+    """Fork the process that kills the group when the worker, or this process, is gone. Its pid."""
     parent = os.getpid()
-    if os.fork() != 0:
+    if (guardian := os.fork()) != 0:
         os.close(life_fd)
-        return
+        return guardian
     os.close(message_fd)
     null = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
@@ -88,10 +99,36 @@ def offer_to_oom_killer() -> None:
         return  # not Linux, or not allowed: a preference, no more
 
 
-def forget_peak_memory() -> None:
-    """Have the kernel count the most memory that this process holds anew, for the next run."""
-    with contextlib.suppress(OSError):  # not Linux, or not allowed: then it is that of all runs
-        Path("/proc/self/clear_refs").write_text("5")
+class PeakMemory:
+    """Has the kernel count the most memory that this process holds anew.
+
+    Opened before the process is confined, which closes /proc for writing.
+    """
+
+    def __init__(self) -> None:
+        self._descriptor = -1
+        with contextlib.suppress(OSError):  # not Linux, or not allowed: then it is that of all runs
+            self._descriptor = os.open("/proc/self/clear_refs", os.O_WRONLY | os.O_CLOEXEC)
+
+    def forget(self) -> None:
+        """Before the next run."""
+        if self._descriptor >= 0:
+            with contextlib.suppress(OSError):
+                os.write(self._descriptor, b"5")
+
+
+@contextlib.contextmanager
+def temporary_folder(path: Path) -> Iterator[None]:
+    """Where the run's temporary files go; removed with all that is in it."""
+    shutil.rmtree(path, ignore_errors=True)
+    path.mkdir(parents=True)
+    usual = os.environ["TMPDIR"]
+    os.environ["TMPDIR"] = tempfile.tempdir = str(path)
+    try:
+        yield
+    finally:
+        os.environ["TMPDIR"] = tempfile.tempdir = usual
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def error_of(error: BaseException, stage: str) -> dict[str, Any]:
@@ -155,16 +192,16 @@ class Run:
 
     def execute(self) -> None:
         """Run the stage and send how it ended."""
-        forget_peak_memory()
         self._messages.send("begun")
+        allow_cpu_seconds(self._command["cpu_s"])
         # What stages and libraries that they load for the first time ask (`use_all_cores`).
         os.environ["OMP_NUM_THREADS"] = str(self._command["threads"])
+        root, lock = self._workspace.root, run_lock(self._stage_name)
+        note = holder_note(self._command["token"])
         try:
-            with folder_lock(
-                self._workspace.root,
-                run_lock(self._stage_name),
-                PREDECESSOR_TIMEOUT_S,
-                holder_note(self._command["token"]),
+            with (
+                folder_lock(root, lock, PREDECESSOR_TIMEOUT_S, note),
+                temporary_folder(Path(self._command["temporary"])),
             ):
                 manifest = self._run()
         except Cancelled:
@@ -261,12 +298,15 @@ def main() -> None:
     parser.add_argument("--message-fd", type=int, required=True)
     parser.add_argument("--life-fd", type=int, required=True)
     parser.add_argument("--registry", required=True)
+    parser.add_argument("--plan", required=True, help="what it may touch")
     parser.add_argument("--preload", nargs="*", default=[], help="stages to load in advance")
     arguments = parser.parse_args()
-    start_guardian(arguments.life_fd, arguments.message_fd)
+    guardian = start_guardian(arguments.life_fd, arguments.message_fd)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.set_inheritable(arguments.message_fd, False)
     offer_to_oom_killer()
+    peak = PeakMemory()
+    contained = apply_plan(Plan.of_json(arguments.plan))  # before there are other threads
     faulthandler.enable()
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s"
@@ -275,10 +315,11 @@ def main() -> None:
     commands: queue.Queue[dict[str, Any]] = queue.Queue()
     stops: dict[str, str] = {}  # by run, why it should end
     threading.Thread(target=read_commands, args=(commands, stops), daemon=True).start()
-    messages.send("hello", pid=os.getpid())
+    messages.send("hello", pid=os.getpid(), guardian=guardian, contained=asdict(contained))
     pieces = preload_steps(arguments.registry, arguments.preload)
     while True:
         command = next_command(commands, pieces)
+        peak.forget()
         Run(command, messages, stops, arguments.registry).execute()
         stops.pop(command["run_id"], None)
         tidy_memory()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
+import stat
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -44,6 +45,7 @@ def upload_folder(
 ) -> None:
     """Upload all files below a folder; its manifest, if any, last.
 
+    Links are passed over: a stage could name a file by one that is closed to it and open to us.
     step: the operation in `storage.steps` that this is.
     """
 
@@ -60,7 +62,9 @@ def upload_folder(
         return move
 
     names = sorted(
-        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if stat.S_ISREG(path.lstat().st_mode)
     )
     _run_all([put(name) for name in names if name != MANIFEST], workers)
     if MANIFEST in names:

@@ -232,11 +232,17 @@ def load_compiled(config: TrainConfig) -> None:
             run_part(part, config)
 
 
-def _watch(part: str, parent: int) -> None:
-    """Say how far the compilation is; end this process when nobody is there to use it."""
-    path = _progress_file(part)
+def _wanted_file(lock: Path) -> Path:
+    """By its being there, whoever waits for a lock asks a background compiler to leave it."""
+    return lock.with_name(f"{lock.name}.wanted")
+
+
+def _watch(part: str, parent: int, background: bool) -> None:
+    """Say how far the compilation is; end this process when nobody is there to use it, or when it
+    stands in the way."""
+    path, wanted = _progress_file(part), _wanted_file(CACHE_FOLDER / f"{part}.lock")
     draft = path.with_name(f"{path.name}.{os.getpid()}")
-    while os.getppid() == parent:
+    while os.getppid() == parent and not (background and wanted.exists()):
         if kernels_compiled():
             draft.write_text(f"{kernels_compiled()} {kernels_known()}")
             draft.replace(path)
@@ -249,6 +255,7 @@ def _hold_lock(path: Path, stack: contextlib.ExitStack) -> None:
     while True:
         try:
             stack.enter_context(file_lock(path, fcntl.LOCK_EX | fcntl.LOCK_NB))
+            _wanted_file(path).unlink(missing_ok=True)
             return
         except BlockingIOError:
             holder = path.read_text()
@@ -258,8 +265,12 @@ def _hold_lock(path: Path, stack: contextlib.ExitStack) -> None:
             if before is None or after is None or path.read_text() != holder:
                 continue
             if after - before < 0.5 * passed:
-                with contextlib.suppress(ProcessLookupError, PermissionError):
+                try:
                     os.kill(int(holder), signal.SIGTERM)
+                except ProcessLookupError:
+                    continue
+                except PermissionError:  # contained processes do not reach each other
+                    _wanted_file(path).touch()
 
 
 def _processor_seconds(pid: str) -> float | None:
@@ -282,7 +293,8 @@ def main(arguments: list[str] | None = None) -> None:
     if chosen.background:
         os.nice(19)
     configs = [config_from_dict(TrainConfig, values) for values in json.loads(sys.stdin.read())]
-    watch = threading.Thread(target=_watch, args=(part, chosen.parent), daemon=True)
+    watched = (part, chosen.parent, chosen.background)
+    watch = threading.Thread(target=_watch, args=watched, daemon=True)
     watch.start()
     lock = CACHE_FOLDER / f"{part}.lock"
     with contextlib.ExitStack() as stack:

@@ -17,6 +17,7 @@ Axes here are COLMAP's: cameras look along +Z, +Y down. Pixel centres lie at (0.
 from __future__ import annotations
 
 import copy
+import os
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -153,8 +154,8 @@ class Reconstructor:
         self.links.mkdir(parents=True, exist_ok=True)
         for name, path in zip(self.names, images, strict=True):
             link = self.links / name
-            if not link.is_symlink():
-                link.symlink_to(path.resolve())
+            if not os.path.lexists(link):
+                _name_again(path.resolve(), link)
 
     def on(self, database: Path) -> Reconstructor:
         """The same images with another database."""
@@ -363,6 +364,15 @@ class Reconstructor:
                 f"COLMAP failed while {what} of {len(self.names)} images.",
                 details={"log": str(error).splitlines()[-20:]},
             ) from error
+
+
+def _name_again(path: Path, link: Path) -> None:
+    """A second name of a file. A contained stage makes no symbolic links, and links of the other
+    kind lead to no other disk."""
+    try:
+        os.link(path, link)
+    except OSError:
+        link.symlink_to(path)
 
 
 def _extraction_options(settings: FeatureSettings) -> Any:

@@ -7,6 +7,7 @@ is orphaned in a session of its own.
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import signal
@@ -34,6 +35,8 @@ _SIGNAL_ADVICE: Mapping[int, str] = {
     signal.SIGILL: "The program was built for another processor: install a build for this one.",
     signal.SIGSEGV: "The program has a fault: try the input converted to another format.",
     signal.SIGABRT: "The program has a fault: try the input converted to another format.",
+    signal.SIGXFSZ: "It wrote a larger file than it may: have the bound of the worker raised.",
+    signal.SIGXCPU: "It used all the processor time that it may: try a shorter input.",
 }
 _NO_LIMIT = float("inf")
 
@@ -109,6 +112,8 @@ class Program:
                 stderr=subprocess.PIPE,
             )
         except OSError as error:
+            if error.errno in (errno.ENOMEM, errno.EMFILE, errno.EAGAIN):
+                raise  # it is there; there is no room for it
             raise ToolError(
                 f"{self._name} cannot be started: {os.strerror(error.errno or 0)}.",
                 code="tool_missing",

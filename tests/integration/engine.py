@@ -58,7 +58,9 @@ class Engine:
         self.database = Database(self.settings.resolved_database_url)
         self.store: ObjectStore = open_object_store(self.settings)
         self.bell = Bell(redis_url, self.database)
-        self.witness = folder / "witness.txt"
+        # Stages are contained: in the home they write to their job's folder and to caches alone.
+        self.witness = folder / "home" / "cache" / "witness.txt"
+        self.witness.parent.mkdir(parents=True, exist_ok=True)
         self.witness.touch()
         (folder / "worker.log").touch()
         self.workers: list[subprocess.Popen[bytes]] = []

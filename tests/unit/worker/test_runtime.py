@@ -28,7 +28,7 @@ from storage.models import Capture, Job, StageRow
 from storage.records import live_workers, register_worker
 from tests.integration.engine import Engine, is_running
 from worker.__main__ import MANY_CORES, default_slots, parse_arguments
-from worker.runner import Pulse
+from worker.pulse import Pulse
 from worker.runtime import WorkerIdentity, WorkerRuntime
 from worker.settings import WorkerSettings
 

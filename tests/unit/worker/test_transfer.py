@@ -22,7 +22,6 @@ from storage.queries import StageInput, StageWork
 from tests.factories import make_database, make_job
 from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.outcomes import crash_of, failure_of
-from worker.process import scrubbed_environment
 from worker.transfer import (
     download_folder,
     fetch_inputs,
@@ -222,32 +221,3 @@ def test_an_exit_status_says_what_happened(
 ) -> None:
     crash = crash_of("train", status, out_of_memory)
     assert (crash.cause, crash.error["code"], crash.exit_code) == (cause, code, status)
-
-
-def test_a_stage_process_sees_no_keys_of_the_service() -> None:
-    environment = {
-        "PATH": "/bin",
-        "NERFWORKS_HOME": "/h",
-        "NERFWORKS_LPIPS_WEIGHTS": "/w",
-        "NERFWORKS_LPIPS_SHA256": "0",
-        "NERFWORKS_DATABASE_URL": "postgresql://u:p@h/d",
-        "NERFWORKS_REDIS_URL": "redis://:p@h",
-        "NERFWORKS_S3_SECRET_ACCESS_KEY": "s",
-        "AWS_ACCESS_KEY_ID": "a",
-        "GOOGLE_APPLICATION_CREDENTIALS": "/g",
-        "MY_API_KEY": "k",
-        "OMP_NUM_THREADS": "3",
-    }
-    kept = scrubbed_environment(environment)
-    assert set(kept) == {
-        "PATH",
-        "NERFWORKS_HOME",
-        "NERFWORKS_LPIPS_SHA256",
-        "NERFWORKS_LPIPS_WEIGHTS",
-        "OMP_NUM_THREADS",
-        "OMP_WAIT_POLICY",
-        "PYTHONPATH",
-        "PYTHONUNBUFFERED",
-    }
-    assert kept["OMP_NUM_THREADS"] == "3"
-    assert kept["OMP_WAIT_POLICY"] == "passive"

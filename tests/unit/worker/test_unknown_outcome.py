@@ -5,6 +5,7 @@ A real runner with a real stage process; the database's answer is lost where a t
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -21,6 +22,7 @@ from tests.factories import root_of
 from tests.faults import at_step, lose_answer
 from tests.integration.engine import Engine
 from worker.checkpoints import CheckpointUploader, Snapshot
+from worker.containment.planning import make_plan
 from worker.runner import Runner
 from worker.settings import WorkerSettings
 
@@ -38,12 +40,14 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
 @pytest.fixture(scope="module")
 def slot(engine: Engine) -> Iterator[Runner]:
     """One warm process for all tests; each gives the runner its database and its shutdown."""
+    settings = WorkerSettings(prepare=False, lease_s=60.0, cancel_poll_s=60.0)
     made = Runner(
         engine.database,
         engine.store,
-        WorkerSettings(prepare=False, lease_s=60.0, cancel_poll_s=60.0),
+        settings,
         work_dir=engine.settings.work_dir,
         registry=TOYS,
+        plan=make_plan(engine.settings, settings, os.environ, has_gpu=False),
         threads=lambda: 1,
         shutdown=threading.Event(),
     )

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from storage.settings import StorageSettings
 from tests.unit.pipelines.stages.tiny_job import make_capture, options_of
+from worker.containment.planning import make_plan
 from worker.process import StageProcess
+from worker.settings import WorkerSettings
 
 REGISTRY = "tests.unit.worker.watched_stages"
 
 
 @pytest.fixture
-def process() -> Iterator[StageProcess]:
-    made = StageProcess(REGISTRY)
+def process(tmp_path: Path) -> Iterator[StageProcess]:
+    # The test's captures lie where jobs would: a stage process reaches nothing else.
+    settings = WorkerSettings(stage_writable=str(tmp_path))
+    storage = StorageSettings(home=tmp_path / "home")
+    made = StageProcess(REGISTRY, make_plan(storage, settings, os.environ, has_gpu=False))
     yield made
     made.kill()
 
@@ -28,7 +35,7 @@ def train(process: StageProcess, root: Path) -> dict[str, Any]:
     options = options_of("train", max_steps=3, rays_per_step=128)
     process.start_run(
         root.name, lines.append, stage="train", options=options, root=str(workspace.root), seed=0,
-        threads=2, token="a-token",
+        threads=2, token="a-token", cpu_s=600.0, temporary=str(workspace.temporary("train")),
     )  # fmt: skip
     while True:
         message = process.messages.get(timeout=300)
