@@ -29,7 +29,7 @@ from typing import Any
 from pipelines.errors import Cancelled, PipelineError, ResourceError
 from pipelines.options import resolve_options, stage_options, stages_skipped
 from pipelines.registry import STAGES, get_stage, load_function
-from pipelines.stage import REPORT, ProgressSink, Stage, StageContext
+from pipelines.stage import REPORT, Memory, ProgressSink, Stage, StageContext
 from pipelines.workspace import MANIFEST, Workspace
 
 FORMAT_VERSION = 1
@@ -179,10 +179,11 @@ def run_stage(
     *,
     seed: int = 0,
     hooks: RunHooks | None = None,
+    memory: Memory = "full",
 ) -> dict[str, Any]:
     """Run a stage on a job's folder and publish its result as `workspace.stage(name)`.
 
-    options_values: of this stage, as `resolve_options` gives them.
+    options_values: of this stage, as `resolve_options` gives them. memory: see `StageContext`.
     Returns the manifest; in its timings `wall_s` is the whole without hashing and publishing, of
     which `load_s` went into hashing inputs and importing the stage's code, and `compile_s` into
     compiling kernels. A worker adds what lies around (`worker.runner`).
@@ -207,6 +208,7 @@ def run_stage(
         out=out,
         checkpoint=checkpoint,
         seed=seed,
+        memory=memory,
         logger=hooks.logger,
         on_progress=hooks.on_progress,
         is_cancelled=hooks.is_cancelled,

@@ -11,13 +11,17 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from pipelines.errors import Cancelled
 from pipelines.workspace import Workspace
 
 REPORT = "report.json"
 """What a stage, or a whole job, says of itself in its own words."""
+
+
+Memory = Literal["full", "small"]
+"""How a stage goes about memory, see `StageContext`."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,9 @@ class StageContext:
     checkpoint: a folder that outlives a failed attempt, also when the next one runs elsewhere;
         a stage that calls `checkpoint_saved` after writing it can go on from there.
     seed: fixed per job, so that a run can be repeated.
+    memory: "small" where an earlier attempt ran out of memory: it then takes less for passing
+        things, tiles and caches, at the price of time and not of results. It has fewer threads,
+        too, which need nothing of the stage.
     is_shutdown: whether it is stopped only because its machine is needed: within seconds it may
         save what the next attempt can go on from, before it reports progress again.
     """
@@ -93,11 +100,17 @@ class StageContext:
     out: Path
     checkpoint: Path
     seed: int = 0
+    memory: Memory = "full"
     logger: logging.Logger = field(default_factory=lambda: logging.getLogger("nerfworks.stage"))
     on_progress: ProgressSink = _ignore_progress
     is_cancelled: Callable[[], bool] = lambda: False
     is_shutdown: Callable[[], bool] = lambda: False
     on_checkpoint: Callable[[], None] = lambda: None
+
+    @property
+    def memory_share(self) -> float:
+        """How much of the usual memory passing things may take, in (0, 1]."""
+        return SMALL_SHARE if self.memory == "small" else 1.0
 
     def progress(self, fraction: float, message: str = "", eta_s: float | None = None) -> None:
         """Report progress and notice a cancel. Cheap: call it as often as is convenient."""
@@ -113,6 +126,9 @@ class StageContext:
         """Tell the runner that `checkpoint` holds a complete state worth keeping."""
         self.on_checkpoint()
 
+
+SMALL_SHARE = 0.25
+"""Of what a stage usually takes for passing things, where memory ran out before."""
 
 StageFunction = Callable[[Any, StageContext], dict[str, Any]]
 """`(options, ctx) -> summary`; the summary is JSON-able and ends in the manifest and the report."""

@@ -37,6 +37,9 @@ CAPS = {
 }
 """How often in a row a stage may end so, without getting on between."""
 
+LESS_MEMORY = "less_memory"
+"""Why a stage that ran out of memory is tried again: the next attempt takes less."""
+
 BOOT_MARK = "#"
 BACKOFF_FIRST_S = 5.0
 BACKOFF_FACTOR = 4.0
@@ -239,6 +242,7 @@ def _lose(
         values = report.values() if report else {}
         fail_for_good(session, job, stages, row, error, when, run=run, **values)
         return "failed"
+    reason = reason or (LESS_MEMORY if run.outcome == "out_of_memory" else "")
     later = when + timedelta(seconds=backoff_s(count - 1)) if count > 1 else None
     set_stage(session, row, "ready", when, run=run, reason=reason, not_before=later, error=error)
     return "ready"

@@ -18,6 +18,7 @@ from storage.db import now
 from storage.errors import InvalidCursorError, NotFoundError
 from storage.models import Capture, Event, Job, StageRow, is_id
 from storage.queue import RESOURCES
+from storage.runs import has_ended
 from storage.states import JOB_STATES
 
 MAX_PAGE = 200
@@ -39,6 +40,7 @@ class StageWork:
     """All that running a claimed stage takes.
 
     inputs: the published stages, by name; of an export those of the job that it is of.
+    ran_out_of_memory: whether an earlier attempt did.
     """
 
     capture_key: str
@@ -50,6 +52,7 @@ class StageWork:
     inputs: dict[str, StageInput]
     checkpoint_prefix: str | None
     is_export: bool = False
+    ran_out_of_memory: bool = False
 
 
 @dataclass(frozen=True)
@@ -189,6 +192,9 @@ def stage_work(session: Session, claim: Claim) -> StageWork:
         },
         checkpoint_prefix=own.checkpoint_prefix,
         is_export=job.parent is not None,
+        ran_out_of_memory=has_ended(
+            session, claim.job_id, claim.name, claim.token, "out_of_memory"
+        ),
     )
 
 

@@ -161,6 +161,21 @@ def count_ends(session: Session, row: StageRow, outcome: str) -> int:
     return count
 
 
+def has_ended(session: Session, job_id: str, stage: str, token: int, outcome: str) -> bool:
+    """Whether a claim before that of this token ended so, in the same generation of the job."""
+    present = run_of(session, job_id, stage, token)
+    if present is None:
+        return False
+    query = select(StageRun.id).where(
+        StageRun.job_id == job_id,
+        StageRun.stage == stage,
+        StageRun.generation == present.generation,
+        StageRun.token < token,
+        StageRun.outcome == outcome,
+    )
+    return session.scalar(query.limit(1)) is not None
+
+
 def list_runs(session: Session, job_id: str) -> list[StageRun]:
     """All claims of a job's stages, oldest first."""
     query = select(StageRun).where(StageRun.job_id == job_id).order_by(StageRun.id)

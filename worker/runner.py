@@ -271,6 +271,9 @@ class Runner:
     ) -> dict[str, Any]:
         process, pulse = self._ensure_process(), Pulse()
         temporary = workspace.temporary(stage.name)
+        threads = int(os.environ.get("OMP_NUM_THREADS") or self._threads())
+        if work.ran_out_of_memory:
+            keeper.log("Memory ran out before: this attempt takes less, and longer.")
 
         def on_line(line: str) -> None:
             pulse.beat()
@@ -286,7 +289,8 @@ class Runner:
                 options=work.options,
                 root=str(workspace.root),
                 seed=work.seed,
-                threads=int(os.environ.get("OMP_NUM_THREADS") or self._threads()),
+                threads=max(threads // 2, 1) if work.ran_out_of_memory else threads,
+                memory="small" if work.ran_out_of_memory else "full",
                 cpu_s=stage.time_limit_s * num_cores(),
                 temporary=str(temporary),
             )

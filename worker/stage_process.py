@@ -4,7 +4,7 @@ It reads commands as JSON lines from stdin and writes messages as JSON lines to 
 own; what stages print to stdout and stderr are log lines.
 
     commands:  {"do": "run", "stage", "options", "root", "seed", "threads", "cpu_s", "temporary",
-                "token", "run_id"}
+                "memory", "token", "run_id"}
                {"do": "stop", "run_id", "reason"}, reason "cancel", "lost" or "shutdown"
     messages:  {"type": "hello", "pid", "guardian", "contained"}, the first of all
                {"type": "begun"}, the first of a run
@@ -226,6 +226,7 @@ class Run:
             self._command["options"],
             self._workspace,
             seed=self._command["seed"],
+            memory=self._command["memory"],
             hooks=RunHooks(
                 on_progress=self._on_progress,
                 is_cancelled=lambda: self._run_id in self._stops,

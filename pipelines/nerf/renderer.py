@@ -75,6 +75,7 @@ class Renderer:
     config: what the fast engine may leave out; with `ALL_SAMPLES` it agrees with the plain one to
         rounding.
     normals: also render normals, which needs a model that learned them and the plain engine.
+    memory_share: how much of the usual memory tiles may take; pictures are the same.
     Raises NerfError `bad_config` for an unknown engine, or for "fast" where it cannot be.
     """
 
@@ -87,11 +88,13 @@ class Renderer:
         device: torch.device | str | None = None,
         config: RenderConfig | None = None,
         normals: bool = False,
+        memory_share: float = 1.0,
     ) -> None:
         self._model = model if device is None else model.to(device)
         self._scene = scene
         self._device = next(model.parameters()).device
         self._config = RenderConfig() if config is None else config
+        self._memory_share = memory_share
         self._baked: BakedGrid | None = None
         if engine not in ("auto", "plain", "fast"):
             raise NerfError(
@@ -246,6 +249,7 @@ class Renderer:
             appearance=appearance,
             early_stop=self._config.early_stop,
             weight_threshold=self._config.weight_threshold,
+            memory_share=self._memory_share,
         )
 
         def draw(rays: Rays) -> dict[str, FloatArray]:
@@ -256,6 +260,7 @@ class Renderer:
     def _plain_tile(self) -> int:
         """Rays whose intermediate tensors fit the memory that a plain chunk may take."""
         budget = PLAIN_BYTES.get(self._device.type, PLAIN_BYTES["cpu"])
+        budget = int(budget * self._memory_share)
         return max(1, min(MAX_PLAIN_RAYS, budget // self._model.bytes_per_ray()))
 
 

@@ -87,7 +87,8 @@ class TrainedScene:
 
     cameras: all cameras of the training run with their split, in the order of the walk as far as
         names tell. extras: whatever else training wrote about the run. render_config: what
-        rendering leaves out; None for the defaults.
+        rendering leaves out; None for the defaults. memory_share: how much of the usual memory
+        rendering may take for its tiles.
     """
 
     def __init__(
@@ -97,22 +98,25 @@ class TrainedScene:
         cameras: CamerasFile,
         extras: dict[str, Any],
         render_config: RenderConfig | None = None,
+        memory_share: float = 1.0,
     ) -> None:
         use_all_cores()
         self.model = model
         self.scene = scene
         self.cameras = cameras
         self.extras = extras
-        self.renderer = Renderer(model, scene, config=render_config)
+        self.renderer = Renderer(model, scene, config=render_config, memory_share=memory_share)
 
     @classmethod
-    def load(cls, path: Path, render_config: RenderConfig | None = None) -> TrainedScene:
+    def load(
+        cls, path: Path, render_config: RenderConfig | None = None, memory_share: float = 1.0
+    ) -> TrainedScene:
         """Read `model.zip`, onto the GPU where there is one. Raises ExportError for a bad file."""
         with nerf_errors_as(ExportError):
             loaded = load_model(path)
             model = loaded.model.to(choose_device("auto"))
         cameras = _cameras_of(loaded.extras)
-        return cls(model, loaded.scene, cameras, loaded.extras, render_config)
+        return cls(model, loaded.scene, cameras, loaded.extras, render_config, memory_share)
 
     def training_images(self, at_most: int = 0) -> list[PosedImage]:
         """The images that were trained on, in the file's order; or so many, evenly picked."""

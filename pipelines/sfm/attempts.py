@@ -213,7 +213,8 @@ class Ladder:
         wanted = FeatureSettings(
             more * options.max_image_px, more * options.num_features, upsample, options.num_threads
         )
-        threads = extraction_threads(wanted, options.memory_mb, _num_processors())
+        memory_mb = int(options.memory_mb * self._ctx.memory_share)
+        threads = extraction_threads(wanted, memory_mb, num_processors())
         return replace(wanted, num_threads=threads)
 
     def _must_upsample(self) -> bool:
@@ -288,7 +289,7 @@ def _spans(num: int) -> list[Span]:
     return list(zip([0.0, *edges], edges, strict=False))
 
 
-def _num_processors() -> int:
+def num_processors() -> int:
     """Processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -114,7 +114,9 @@ class _Meter:
 def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     """Measure. The summary is the content of `metrics.json`; without held-out images it is null."""
     config = evaluate_config(options)
-    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip", config.render)
+    scene = TrainedScene.load(
+        ctx.workspace.stage("train") / "model.zip", config.render, ctx.memory_share
+    )
     if next(scene.model.parameters()).device.type == "cpu":
         scene.model.set_engine("fast")  # fits and densities ask the model itself, no renderer
     (ctx.out / "images").mkdir(exist_ok=True)

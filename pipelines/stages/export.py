@@ -20,7 +20,7 @@ from pipelines.stage import StageContext
 def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     """Make the export that has the stage's name. Raises ExportError and what the export raises."""
     config = render_config(options) if isinstance(options, RenderingOptions) else None
-    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip", config)
+    scene = TrainedScene.load(ctx.workspace.stage("train") / "model.zip", config, ctx.memory_share)
     return get_export(ctx.stage).run(scene, options, ctx)
 
 

@@ -22,7 +22,7 @@ from pipelines.exports.formats.ply import write_points
 from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.orientation import Normalisation, normalise, opengl_from_opencv
-from pipelines.sfm.attempts import Checkpoint, Ladder
+from pipelines.sfm.attempts import Checkpoint, Ladder, num_processors
 from pipelines.sfm.found_images import FoundImages, found_images
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled
 from pipelines.sfm.report import build_report, check_usable, report_of_failure, report_of_model
@@ -65,7 +65,7 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             checkpoint.database(RUNGS[0].matches.database),
             source.paths,
             Path(scratch),
-            num_threads=options.num_threads,
+            num_threads=_num_threads(options, ctx),
             seed=ctx.seed,
         )
         ladder = Ladder(reconstructor, checkpoint, source, options, ctx)
@@ -90,6 +90,14 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     _write_report(ctx, report)
     ctx.progress(1.0, f"{len(model.indices)} of {len(source.files)} images registered", 0.0)
     return {key: report[key] for key in _SUMMARY}
+
+
+def _num_threads(options: PosesOptions, ctx: StageContext) -> int:
+    """Threads of matching and mapping: half of what there is, where memory ran out before."""
+    if ctx.memory == "full":
+        return options.num_threads
+    wanted = options.num_threads if options.num_threads > 0 else num_processors()
+    return max(wanted // 2, 1)
 
 
 def _settle_lenses(

@@ -77,7 +77,7 @@ def run(options: Any, ctx: StageContext) -> dict[str, Any]:
     (ctx.out / "deep").mkdir()
     (ctx.out / "deep" / "result ä.txt").write_text(f"{ctx.stage} {steps}")
     read = [name for name in get_stage(ctx.stage).reads if ctx.workspace.is_complete(name)]
-    _note(witness, f"{ctx.stage} end")
+    _note(witness, f"{ctx.stage} end {ctx.memory} {os.environ['OMP_NUM_THREADS']}")
     return {"steps": steps, "first": first, "read": read}
 
 
@@ -104,6 +104,10 @@ def _misbehave(plan: dict[str, Any], ctx: StageContext, witness: Path) -> None:
         raise TrainingError("The GPU is gone.", code="gpu_lost", retryable=True)
     if earlier < plan.get("crash_times", 0):
         os.kill(os.getpid(), signal.SIGKILL)
+    if plan.get("hungry") and ctx.memory == "full":
+        raise MemoryError
+    if plan.get("starving"):
+        raise MemoryError
     if plan.get("fault"):
         raise ZeroDivisionError("/secret/path")
     while earlier < plan.get("hang_times", 0):  # alive, and it says the same again and again

@@ -475,7 +475,7 @@ def test_history_keeps_what_a_later_claim_overwrites(database: Database) -> None
     assert told == [
         ("stage.ready", "service", ""),
         ("stage.running", "worker:w1", ""),
-        ("stage.ready", "worker:w1", "tool_failed"),
+        ("stage.ready", "worker:w1", "less_memory"),
         ("stage.running", "worker:w2", ""),
         ("stage.succeeded", "worker:w2", ""),
     ]

@@ -80,7 +80,7 @@ class Nosy:
         (self.workspace.root / "orders.json").write_text(json.dumps(orders))
         self.process.start_run(
             "r1", self.lines.append, do="run", stage="ingest", token=1, options={}, seed=0,
-            root=str(self.workspace.root), threads=1, cpu_s=cpu_s,
+            root=str(self.workspace.root), threads=1, cpu_s=cpu_s, memory="full",
             temporary=str(self.workspace.temporary("ingest")),
         )  # fmt: skip
         while True:

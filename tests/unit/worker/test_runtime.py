@@ -25,6 +25,7 @@ from storage.claims import claim_stage
 from storage.jobs import stage_id
 from storage.leases import owner_name
 from storage.models import Capture, Job, StageRow
+from storage.queries import list_events
 from storage.records import live_workers, register_worker
 from tests.integration.engine import Engine, is_running
 from worker.__main__ import MANY_CORES, default_slots, parse_arguments
@@ -255,6 +256,29 @@ def test_a_stage_that_gives_up_unasked_is_tried_again(engine: Engine) -> None:
         row = engine.stage(job, "ingest")
         assert (row.state, (row.error or {}).get("code")) == ("ready", "internal_error")
         assert engine.wait_for(job, "succeeded", "failed").state == "succeeded"
+
+
+@pytest.mark.parametrize("appetite", ["hungry", "starving"])
+def test_a_stage_without_memory_is_tried_once_more_with_less(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, appetite: str
+) -> None:
+    monkeypatch.setattr("worker.runtime.num_cores", lambda: 8)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    job = engine.submit({"frames": {appetite: True}}, ring=False)
+    with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
+        ended = engine.wait_for(job, "succeeded", "failed", timeout_s=240)
+    second = "succeeded" if appetite == "hungry" else "out_of_memory"
+    assert engine.outcomes(job, "frames") == ["out_of_memory", second]
+    assert ended.state == ("succeeded" if appetite == "hungry" else "failed")
+    assert (ended.error or {}).get("code") == (None if appetite == "hungry" else "out_of_memory")
+    with engine.database.read_scope() as session:
+        said = [event for event in list_events(session, job) if event.stage == "frames"]
+    assert [event.reason for event in said if event.kind == "stage.ready"][-1] == "less_memory"
+    assert any("this attempt takes less" in line for line in engine.log(job, "frames"))
+    if appetite == "hungry":
+        assert engine.notes("ingest end") == ["ingest end full 8"]
+        assert engine.notes("frames end") == ["frames end small 4"]
+        assert engine.notes("train end") == ["train end full 8"]
 
 
 def test_silence_counts_only_while_somebody_watches() -> None:

@@ -35,7 +35,8 @@ def train(process: StageProcess, root: Path) -> dict[str, Any]:
     options = options_of("train", max_steps=3, rays_per_step=128)
     process.start_run(
         root.name, lines.append, stage="train", options=options, root=str(workspace.root), seed=0,
-        threads=2, token="a-token", cpu_s=600.0, temporary=str(workspace.temporary("train")),
+        threads=2, token="a-token", cpu_s=600.0, memory="full",
+        temporary=str(workspace.temporary("train")),
     )  # fmt: skip
     while True:
         message = process.messages.get(timeout=300)

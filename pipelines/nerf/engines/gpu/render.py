@@ -59,6 +59,7 @@ class TileDrawer:
 
     model: of `can_draw`, in `eval()`. appearance: as in `Model.forward`. samples: per round, the
     field's last, each at most what the model's options say; None for those of the model.
+    memory_share: how much of TILE_BYTES a tile may take.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class TileDrawer:
         early_stop: float = 1e-3,
         weight_threshold: float = 1e-3,
         samples: tuple[int, ...] | None = None,
+        memory_share: float = 1.0,
     ) -> None:
         config = model.config
         own = (*config.num_proposal_samples, config.num_nerf_samples)
@@ -79,7 +81,7 @@ class TileDrawer:
         self._parts = _gpu_parts(model, device) if device.type == "cuda" else _plain_parts()
         grids = [model.field.grid, *(network.grid for network in model.proposals)]
         widest = max(count * grid.num_outputs for count in self._samples for grid in grids)
-        self.tile_rays = max(1024, TILE_BYTES // (BYTES_PER_FEATURE * widest))
+        self.tile_rays = max(1024, int(TILE_BYTES * memory_share) // (BYTES_PER_FEATURE * widest))
         """Rays of one tile whose tensors fit the memory meant for them."""
 
     @torch.no_grad()

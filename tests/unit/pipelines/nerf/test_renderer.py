@@ -48,6 +48,18 @@ def assert_same(one: RenderedImage, other: RenderedImage) -> None:
     assert np.isclose(one.depth, other.depth, rtol=1e-3).mean() > 0.98
 
 
+def test_less_memory_makes_smaller_tiles_and_the_same_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model, cameras = random_model(), two_cameras()
+    monkeypatch.setattr(renderer_module, "PLAIN_BYTES", {"cpu": 200 * model.bytes_per_ray()})
+    usual = Renderer(model, SCENE, engine="plain")
+    small = Renderer(model, SCENE, engine="plain", memory_share=0.25)
+    assert (usual._plain_tile(), small._plain_tile()) == (200, 50)
+    one, other = usual.render(cameras, 1), small.render(cameras, 1)
+    np.testing.assert_allclose(one.rgb, other.rgb, atol=1e-5)
+
+
 @pytest.mark.parametrize("index", [0, 1], ids=["pinhole", "distorted"])
 def test_both_engines_show_the_same_picture(index: int) -> None:
     model, cameras = random_model(), two_cameras()
