@@ -1,0 +1,83 @@
+"""Files that people open in a browser, shown there. Needs Chromium, and npm once for three.js."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipelines.exports.formats.glb import GlbStyle, write_mesh
+from pipelines.exports.formats.mp4 import VideoWriter
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+from tests.benchmarks.browser import NoBrowserError, find_browser, show, three_folder
+
+RED, GREEN = np.array([220, 40, 30]), np.array([30, 180, 60])
+
+
+@pytest.fixture(autouse=True)
+def _needs_a_browser() -> None:
+    try:
+        find_browser()
+    except NoBrowserError as error:
+        pytest.skip(str(error))
+
+
+def _square(textured: bool) -> TriangleMesh | TexturedMesh:
+    """Stands upright, its face to -Y, which is glTF's +Z: red below, green above."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]], np.float64)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    normals = np.tile([0.0, -1.0, 0.0], (4, 1))
+    if textured:
+        uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float64)
+        picture = np.repeat([GREEN, RED], 32, axis=0)[:, None].repeat(64, axis=1)
+        return TexturedMesh(vertices, faces, normals, uv, picture.astype(np.uint8))
+    colors = np.stack([RED, RED, GREEN, GREEN]) / 255.0
+    return TriangleMesh(vertices, faces, colors, normals)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("textured", [False, True], ids=["vertex-colours", "texture"])
+@pytest.mark.parametrize(
+    "style", [GlbStyle(), GlbStyle(quantized=True)], ids=["plain", "quantized"]
+)
+def test_three_js_shows_a_mesh_upright_in_its_colours(
+    tmp_path: Path, textured: bool, style: GlbStyle
+) -> None:
+    try:
+        three_folder()
+    except NoBrowserError as error:
+        pytest.skip(str(error))
+    path = tmp_path / "mesh.glb"
+    write_mesh(path, _square(textured), style=style)
+    shown = show(path, tmp_path, turns=1)
+    assert shown.problem == ""
+    assert shown.facts["triangles"] == 2
+    assert shown.picture is not None
+    with Image.open(shown.picture) as opened:
+        picture = np.asarray(opened.convert("RGB")).astype(int)
+    below, above = picture[190, 160], picture[125, 160]
+    if textured:
+        np.testing.assert_allclose(below, RED, atol=24)
+        np.testing.assert_allclose(above, GREEN, atol=24)
+    else:
+        # The colours go over into each other, by light and not by sRGB.
+        assert below[0] > 1.5 * below[1]
+        assert above[1] > above[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("codec", "sphere"), [("h264", False), ("h264", True), ("av1", False)])
+def test_a_video_plays(tmp_path: Path, codec: str, sphere: bool) -> None:
+    path = tmp_path / "video.mp4"
+    with VideoWriter(path, 160, 80, 24.0, 18, codec, equirectangular=sphere) as writer:
+        for index in range(48):
+            frame = np.full((80, 160, 3), 40, np.uint8)
+            frame[:, 3 * index : 3 * index + 10] = (250, 200, 40)
+            writer.write(frame)
+    shown = show(path, tmp_path)
+    assert shown.problem == ""
+    assert (shown.facts["width"], shown.facts["height"]) == (160, 80)
+    assert shown.facts["duration_s"] == pytest.approx(2.0, abs=0.1)
+    assert shown.facts["played_s"] > 0.1
