@@ -2,7 +2,8 @@
 
 Sessions commit at the edge: a caller opens `Database.session_scope()` once per unit of work and the
 functions of this room never commit. On SQLite a writing session starts with BEGIN IMMEDIATE, so
-that two writers queue up instead of failing half-way; on PostgreSQL rows are locked where needed.
+that two writers queue up instead of failing half-way: those of one process in the order in which
+they came (`storage.turns`), processes by asking often. On PostgreSQL rows are locked where needed.
 
 The clock of leases is the database's: `now(session)` asks PostgreSQL, so that machines with clocks
 apart agree, and reads this machine's clock for SQLite, which only one machine can share. All times
@@ -15,7 +16,7 @@ import math
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -35,12 +36,15 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.engine import Connection
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
 from storage.postgres import bound
 from storage.steps import reached
+from storage.turns import Turns
 
 BUSY_TIMEOUT_S = 30.0
+ASK_AGAIN_MS = 10
 STATEMENT_S = 15.0
 POOL_S = 10.0
 ACTOR = "actor"
@@ -158,7 +162,32 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
 
 def _begin_sqlite(connection: Connection) -> None:
     reading = connection.get_execution_options().get("nerfworks_read_only", False)
-    connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
+    if reading:
+        connection.exec_driver_sql("BEGIN")
+    else:
+        _begin_writing(connection)
+
+
+def _begin_writing(connection: Connection) -> None:
+    """Begin as soon as no other process writes. Raises OperationalError where that takes too long.
+
+    SQLite itself asks ever more rarely the longer it waits, so that who came last goes first.
+    """
+    raw: Any = connection.connection.driver_connection
+    deadline = time.monotonic() + BUSY_TIMEOUT_S
+    raw.execute(f"PRAGMA busy_timeout = {ASK_AGAIN_MS}")
+    try:
+        while time.monotonic() < deadline:
+            try:
+                raw.execute("BEGIN IMMEDIATE")
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY:
+                    break
+            else:
+                return
+        connection.exec_driver_sql("BEGIN IMMEDIATE")  # fails in SQLAlchemy's words
+    finally:
+        raw.execute(f"PRAGMA busy_timeout = {int(BUSY_TIMEOUT_S * 1000)}")
 
 
 def make_engine(url: str, deadline_s: float = STATEMENT_S) -> Engine:
@@ -194,6 +223,7 @@ class Database:
     def __init__(self, url: str, deadline_s: float = STATEMENT_S) -> None:
         """deadline_s: for one statement on PostgreSQL, in seconds."""
         self.engine = make_engine(url, deadline_s)
+        self._turns = Turns() if self.engine.dialect.name == "sqlite" else None
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         self._read = sessionmaker(
             self.engine.execution_options(nerfworks_read_only=True), expire_on_commit=False
@@ -208,7 +238,7 @@ class Database:
         actor: who changes something, for the record. step: the operation in `storage.steps` that
         this transaction is.
         """
-        with self._write.begin() as session:
+        with self._turn(), self._write.begin() as session:
             if actor is not None:
                 name_actor(session, actor)
             yield session
@@ -216,6 +246,17 @@ class Database:
                 reached(f"{step}.commit")
         if step is not None:
             reached(f"{step}.committed")
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        """Around a session that may write. Raises OperationalError where others take too long."""
+        with ExitStack() as held:
+            if self._turns is not None:
+                try:
+                    held.enter_context(self._turns.one(BUSY_TIMEOUT_S))
+                except TimeoutError as error:
+                    raise OperationalError("BEGIN IMMEDIATE", {}, error) from error
+            yield
 
     @contextmanager
     def read_scope(self) -> Iterator[Session]:

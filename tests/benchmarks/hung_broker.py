@@ -1,31 +1,47 @@
-"""What the API's callers notice of a broker that accepts, and never answers.
+"""What the API's callers, and leases, notice of a broker that accepts, and never answers.
 
     python -m tests.benchmarks.hung_broker [--posts 100]
 
-Starts the API as a process of its own, on SQLite, with such a broker; sends jobs from eight
-connections and, meanwhile, reads a job and asks /livez. Prints the median, the 99th percentile and
-the slowest of each, in milliseconds.
+Starts the API as a process of its own with such a broker, on SQLite and, where the wheel is
+installed, on PostgreSQL; sends jobs from eight connections and, meanwhile, reads a job and asks
+/livez. Beside it a worker's housekeeping, which rings the same broker, takes back leases that run
+out. Prints the median, the 99th percentile and the slowest of each, in milliseconds; of the leases
+what passed between their end and their taking back, of which up to a round (`tick_s`) is meant to.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 
 import httpx
+from sqlalchemy import select
 
-from tests.services import Gate, free_port, stop, wait_for_port
-from tests.unit.api.conftest import KEY, zip_of_pictures
+from storage.bell import Bell
+from storage.claims import claim_stage
+from storage.db import Database, now
+from storage.jobs import stage_id
+from storage.models import Event, StageRow
+from storage.objects_local import LocalObjectStore
+from tests.benchmarks.api_process import HEADERS, empty_databases, kinds, serving
+from tests.factories import make_job
+from tests.services import Gate
+from tests.unit.api.conftest import zip_of_pictures
+from worker.housekeeping import Housekeeping
+from worker.settings import WorkerSettings
 
 CONNECTIONS = 8
+NUM_LEASES = 20
+LEASE_STEP_S = 0.25
+TICK_S = 1.0
 
 
 def timed(http: httpx.Client, path: str, done: threading.Event) -> list[float]:
@@ -55,10 +71,76 @@ def measure(http: httpx.Client, posts: int) -> dict[str, list[float]]:
     with ThreadPoolExecutor(2) as pollers, ThreadPoolExecutor(CONNECTIONS) as posters:
         reads = pollers.submit(timed, http, f"/v1/jobs/{job}", done)
         lives = pollers.submit(timed, http, "/livez", done)
-        posted = [*posters.map(post, range(posts))]
-        done.set()
+        try:
+            posted = [*posters.map(post, range(posts))]
+        finally:
+            done.set()
     got, alive = reads.result(), lives.result()
     return {"POST /v1/jobs": posted, "GET /v1/jobs/ID": got, "GET /livez": alive}
+
+
+@contextmanager
+def reaping(database: Database, broker_port: int, folder: Path) -> Iterator[list[float]]:
+    """Leases that run out one by one, and housekeeping that takes them back, around a block.
+
+    After it: the milliseconds that each was late.
+    """
+    ends = {}
+    with database.session_scope() as session:
+        jobs = [make_job(session).id for _ in range(NUM_LEASES)]
+        for job in jobs:
+            assert claim_stage(session, stage_id(job, "first"), "gone", 3600.0) is not None
+    with database.session_scope() as session:
+        begun = now(session)
+        for place, job in enumerate(jobs):
+            ends[job] = begun + timedelta(seconds=(place + 1) * LEASE_STEP_S)
+            session.get_one(StageRow, stage_id(job, "first")).lease_until = ends[job]
+    keeper = Housekeeping(
+        database,
+        LocalObjectStore(folder / "objects", public_url="", signing_key=b""),
+        Bell(f"redis://127.0.0.1:{broker_port}/0", database),
+        WorkerSettings(tick_s=TICK_S),
+        work_dir=folder / "work",
+        register=lambda: None,
+        offer=lambda: None,
+    )
+    late: list[float] = []
+    keeper.start()
+    yield late
+    end = time.monotonic() + 120.0
+    taken = select(Event.job_id, Event.created_at).where(Event.reason == "lease_expired")
+    while True:
+        with database.read_scope() as session:
+            found = session.execute(taken).all()
+        if len(found) == NUM_LEASES or time.monotonic() > end:
+            break
+        time.sleep(TICK_S)
+    keeper.stop(10.0)
+    assert len(found) == NUM_LEASES, "leases that ran out were not taken back"
+    late += [1000.0 * (moment - ends[job_id]).total_seconds() for job_id, moment in found]
+
+
+def report(kind: str, posts: int) -> None:
+    """Print the table of one kind of database."""
+    broker = Gate()
+    try:
+        with (
+            empty_databases(kind, 1) as (url,),
+            tempfile.TemporaryDirectory(prefix="nwhb") as folder,
+            serving(url, broker.port) as address,
+            httpx.Client(base_url=address, headers=HEADERS, timeout=120) as http,
+        ):
+            database = Database(url)
+            with reaping(database, broker.port, Path(folder)) as late:
+                found = measure(http, posts)
+            database.dispose()
+    finally:
+        broker.close()
+    print(f"{kind:<18}{'calls':>7}{'p50':>9}{'p99':>9}{'slowest':>9}  ms")
+    for name, spent in {**found, f"reaping (/{TICK_S:.0f} s)": late}.items():
+        p99 = statistics.quantiles(spent, n=100, method="inclusive")[98]
+        row = f"{statistics.median(spent):>9.1f}{p99:>9.1f}{max(spent):>9.1f}"
+        print(f"{name:<18}{len(spent):>7}{row}", flush=True)
 
 
 def main() -> None:
@@ -67,34 +149,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--posts", type=int, default=100)
+    parser.add_argument("--only", choices=["sqlite", "postgresql"])
     chosen = parser.parse_args()
-    broker, port = Gate(), free_port()
-    with tempfile.TemporaryDirectory(prefix="nwhb") as home:
-        environment = {
-            **os.environ,
-            "NERFWORKS_HOME": home,
-            "NERFWORKS_REDIS_URL": f"redis://127.0.0.1:{broker.port}/0",
-            "NERFWORKS_BOOTSTRAP_API_KEY": KEY,
-        }
-        with (Path(home) / "api.log").open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "api", "--port", str(port)], env=environment, stderr=log
-            )
-        try:
-            wait_for_port(port, process, 60.0)
-            key = {"Authorization": f"Bearer {KEY}"}
-            with httpx.Client(
-                base_url=f"http://127.0.0.1:{port}", headers=key, timeout=120
-            ) as http:
-                found = measure(http, chosen.posts)
-        finally:
-            stop(process)
-            broker.close()
-    print(f"{'':<18}{'calls':>7}{'p50':>9}{'p99':>9}{'slowest':>9}  ms")
-    for name, spent in found.items():
-        p99 = statistics.quantiles(spent, n=100)[98]
-        row = f"{statistics.median(spent):>9.1f}{p99:>9.1f}{max(spent):>9.1f}"
-        print(f"{name:<18}{len(spent):>7}{row}")
+    for kind in kinds():
+        if chosen.only in (None, kind):
+            report(kind, chosen.posts)
 
 
 if __name__ == "__main__":

