@@ -74,7 +74,7 @@ def test_a_job_succeeds_though_the_machine_sleeps_five_times(
         assert redis_server.process is not None
         machine = [*(worker.pid for worker in workers), redis_server.process.pid]
         job = engine.submit({"train": {"until": str(gate)}}, skip=("mesh", "video"))
-        engine.wait(lambda: engine.notes("train start"))
+        engine.wait(lambda: engine.notes("train start"), 120)
         for _ in range(SLEEPS):
             with asleep(*machine):
                 time.sleep(LEASE_S + 1.0)
@@ -98,14 +98,14 @@ def test_two_workers_started_with_one_id_both_work_and_rob_nobody(
         for _ in range(2):
             engine.start_worker("w")
         jobs = [engine.submit({"train": {"until": str(gate)}}) for _ in range(2)]
-        engine.wait(lambda: len(engine.notes("train start")) == 2)
+        engine.wait(lambda: len(engine.notes("train start")) == 2, 120)
         third = engine.start_worker("w")  # as if somebody had forgotten the others
 
         def ids() -> list[str]:
             with engine.database.read_scope() as session:
                 return [worker.id for worker in live_workers(session)]
 
-        engine.wait(lambda: len(ids()) == 3)
+        engine.wait(lambda: len(ids()) == 3, 120)
         assert sum(name == "w" for name in ids()) == 1
         assert all(name == "w" or name.startswith("w-") for name in ids())
         third.kill()
