@@ -20,6 +20,7 @@ OF_THE_WHOLE_PRODUCT = (
     "geometry_truth.py",
     "hung_broker.py",
     "job_overhead.py",
+    "long_film.py",
     "poses_speed.py",
     "poses_ways.py",
     "scene_capture.py",
