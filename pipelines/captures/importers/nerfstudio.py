@@ -5,7 +5,8 @@ Keys: `pipelines.captures.transforms_json`; at the top also applied_transform, a
 The file's world is kept as it is and taken as +Z up, unless the pictures clearly say that another
 of its axes is, and `orientation_override` does not forbid a turn: +Z is nerfstudio's own
 convention, and what `applied_transform` has led to. That, a turn in it, and `applied_scale` are
-written down in the notes. Nothing says that its unit is the metre, also where there is depth.
+written down in the notes. Nothing says that its unit is the metre, also where there is depth, but
+for `metric`, which our own exports of metric worlds have.
 
 KIRI Engine writes this layout as it is. NeRFCapture does too, and says more than it writes: its
 files alone have `depth_integer_scale`, and then the world is ARKit's, metres, +Y up, and pixel
@@ -36,6 +37,7 @@ _FILE = "transforms.json"
 _ORIENTATION = "orientation_override"
 """Of nerfstudio: how to turn the world; "none" says that it is upright as it is."""
 _OF_NERFCAPTURE = "depth_integer_scale"
+_METRIC = "metric"
 _PIXEL_CENTRE = 0.5
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
@@ -66,7 +68,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     return PosedPictures(
         sources=sources,
         failures=listed.failures,
-        metric=is_arkit,
+        metric=is_arkit or top.get(_METRIC) is True,
         up="known" if is_arkit or top.get(_ORIENTATION) == "none" else "assumed",
         notes={"world": "ARKit, turned to +Z up"} if is_arkit else _notes(top) | motion,
         details={

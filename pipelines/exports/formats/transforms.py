@@ -20,6 +20,8 @@ from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 
 _PERSPECTIVE = ("PINHOLE", "OPENCV")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_METRIC = "metric"
+"""A word of our own, which other readers pass over: the world's unit is the metre."""
 _PASSED_ON = ("applied_transform", "applied_scale")
 
 
@@ -42,6 +44,7 @@ def transforms_text(
     content: dict[str, Any] = {
         "camera_model": _camera_model(lenses),
         "orientation_override": "none",
+        **({_METRIC: True} if cameras.metric else {}),
         **{name: cameras.notes[name] for name in _PASSED_ON if name in cameras.notes},
     }
     if points is not None:

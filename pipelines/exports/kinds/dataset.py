@@ -120,7 +120,7 @@ def _bare(cameras: CamerasFile) -> CamerasFile:
 
 EXPORT = Export(
     kind="dataset",
-    version=1,
+    version=2,
     run=run,
     options=DatasetOptions,
     reads=("ingest", "frames", "poses"),

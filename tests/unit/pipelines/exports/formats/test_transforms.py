@@ -54,8 +54,10 @@ def imported(cameras: CamerasFile, folder: Path) -> CamerasFile:
     "lenses", [[LENSES[0]], [LENSES[1]], [LENSES[2]], LENSES[:2]], ids=lambda lenses: len(lenses)
 )
 def test_our_importer_reads_the_same_cameras(tmp_path: Path, lenses: list[Intrinsics]) -> None:
-    cameras = posed(*lenses, masks=True)
+    metric = lenses != [LENSES[1]]
+    cameras = dataclasses.replace(posed(*lenses, masks=True), metric=metric)
     back = imported(cameras, tmp_path)
+    assert back.metric is metric
     assert len(back.images) == len(cameras.images)
     for image, found in zip(cameras.images, back.images, strict=True):
         np.testing.assert_allclose(found.world_from_camera, image.world_from_camera, atol=1e-12)
