@@ -54,6 +54,7 @@ from pipelines.nerf.options.train import TrainConfig, config_from_dict
 from pipelines.nerf.renderer import Renderer
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.stereo.maps import find_depth_maps
+from pipelines.nerf.stereo.refinement import Pictures, photo_offsets
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.nerf.training.loop import train
 
@@ -223,6 +224,9 @@ def _find_made_depth() -> None:
     views = [StereoView(grey, lens, np.column_stack([np.eye(3), place])) for place in places]
     wall = np.column_stack([np.linspace(-0.5, 0.5, 50), np.zeros(50), np.full(50, 2.0)])
     find_depth_maps(views, StereoConfig(num_planes=16), wall)
+    toward = np.tile([0.0, 0.0, -1.0], (len(wall), 1))
+    everywhere = np.ones((len(views), len(wall)), np.uint8)
+    photo_offsets(wall, toward, everywhere, Pictures.of(views, np.zeros(3)), 1)
 
 
 def load_compiled(config: TrainConfig) -> None:

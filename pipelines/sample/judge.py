@@ -172,8 +172,9 @@ def judge_surface(
     points, off = np.zeros((0, 3)), np.zeros(0)
     missing = np.full(len(true_points), np.inf)
     if len(faces):
-        points = _points_on_mesh(moved, faces, num_points)
-        points = points[region.grown(scene.beyond).contains(points)]
+        counted = region.grown(scene.beyond)
+        points = _points_on_mesh(moved, _reaching_into(counted, moved, faces), num_points)
+        points = points[counted.contains(points)]
         points = points[_in_view(points, truth)]
         off = surface_distance(points, scene)
         missing = _distance_to_mesh(true_points, moved, faces)
@@ -194,6 +195,18 @@ def judge_surface(
         accuracy=float(np.median(off)) / size if len(off) else np.inf,
         completeness=float(np.median(missing)) / size,
     )
+
+
+def _reaching_into(
+    region: Region, vertices: Floats, faces: NDArray[np.integer]
+) -> NDArray[np.integer]:
+    """The faces [F, 3] whose box meets the region's, or all of them where none does: what lies far
+    away would take most of the points that are spread by area.
+    """
+    corners = vertices[faces]
+    near = (corners.min(axis=1) <= region.high) & (corners.max(axis=1) >= region.low)
+    met = near.all(axis=1)
+    return faces[met] if met.any() else faces
 
 
 def _shares(distances: Floats, size: float) -> dict[float, float]:

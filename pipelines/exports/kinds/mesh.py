@@ -8,7 +8,7 @@ STL is shape alone.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,6 +23,7 @@ from pipelines.stage import Artifact, StageContext
 if TYPE_CHECKING:
     from pipelines.exports.formats.glb import GlbStyle
     from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+    from pipelines.scene.cameras_file import Intrinsics
     from pipelines.scene.trained_scene import TrainedScene
 
 Format = Literal["glb", "ply", "obj", "stl", "usdz"]
@@ -34,7 +35,9 @@ _FILES: dict[Format, str] = {
     "stl": "mesh.stl",
     "usdz": "mesh.usdz",
 }
-_RENDER_SHARE, _FUSE_SHARE, _TEXTURE_SHARE = 0.6, 0.8, 0.97
+_RENDER_SHARE, _FUSE_SHARE, _REFINE_SHARE, _TEXTURE_SHARE = 0.5, 0.65, 0.85, 0.97
+_PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
+"""Photos that refine the mesh are so long, or shorter where all of them would have more pixels."""
 
 
 class MeshOptions(CropOptions, TextureOptions):
@@ -60,6 +63,11 @@ class MeshOptions(CropOptions, TextureOptions):
     )
     render_long_side_px: int = Field(
         640, ge=64, le=4096, description="Long side of the rendered depth, in pixels."
+    )
+    refine: Literal["photos", "none"] = Field(
+        "photos",
+        description="photos moves the fused surface onto what the training photos agree on, a "
+        "fraction of a voxel, and leaves out what no two of them show; none leaves it as fused.",
     )
     max_faces: int = Field(
         200_000,
@@ -115,10 +123,12 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.formats import glb
     from pipelines.exports.levels import levels_of, texture_px_of
     from pipelines.exports.reduction import reduced
+    from pipelines.exports.surface.refinement import refined
     from pipelines.exports.surface.shells import Shell, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
     from pipelines.exports.texture.bake import painted
     from pipelines.scene.depth_views import Pinhole
+    from pipelines.scene.stereo_views import stereo_view
 
     ctx.progress(0.0, "looking for the scene's bounds")
     probes = scene.probe_views(ctx.check_cancelled)
@@ -149,14 +159,28 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         )
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
+    shown = scene.training_images()
+    if options.refine == "photos":
+        side = _photo_side([scene.lens_of(image) for image in shown])
+        photos = [
+            stereo_view(ctx.workspace.images_root, image, scene.lens_of(image), side)
+            for image in shown
+        ]
+        mesh = refined(
+            mesh,
+            photos,
+            lambda done: ctx.progress(
+                _FUSE_SHARE + (_REFINE_SHARE - _FUSE_SHARE) * done, "refining", None
+            ),
+        )
+        del photos
     whole, mesh = mesh, cropped(mesh, crop)
     if crop is not None and len(mesh.faces) == 0:
         raise empty_crop(crop, whole.vertices, "mesh")
     if options.triangles:
-        ctx.progress(_FUSE_SHARE, f"reducing {len(mesh.faces)} triangles")
+        ctx.progress(_REFINE_SHARE, f"reducing {len(mesh.faces)} triangles")
         mesh = reduced(mesh, options.triangles)
-    shown = scene.training_images()
-    each = (_TEXTURE_SHARE - _FUSE_SHARE) / (1 + options.lods)
+    each = (_TEXTURE_SHARE - _REFINE_SHARE) / (1 + options.lods)
 
     def paint(shape: TriangleMesh, level: int) -> TriangleMesh | TexturedMesh:
         side = texture_px_of(level, options.texture_px)
@@ -166,7 +190,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             [scene.lens_of(image) for image in shown],
             options.model_copy(update={"texture_px": side}),
             ctx,
-            (_FUSE_SHARE + each * level, _FUSE_SHARE + each * (level + 1)),
+            (_REFINE_SHARE + each * level, _REFINE_SHARE + each * (level + 1)),
         )
 
     skin = paint(mesh, 0)
@@ -196,6 +220,12 @@ def style_of(options: MeshOptions) -> GlbStyle:
     from pipelines.exports.formats.glb import GlbStyle
 
     return GlbStyle(options.glb_unlit, options.glb_quantized)
+
+
+def _photo_side(lenses: Sequence[Intrinsics]) -> int:
+    """The long side of the photos that refine the mesh, px."""
+    squares = sum(min(lens.width, lens.height) / max(lens.width, lens.height) for lens in lenses)
+    return min(_PHOTO_SIDE_PX, int((_PHOTOS_PX / squares) ** 0.5))
 
 
 def _told(skin: TriangleMesh | TexturedMesh) -> dict[str, Any]:

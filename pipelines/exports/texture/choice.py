@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import open3d
 from numpy.typing import NDArray
 
+from pipelines.exports.surface.sight import Sight
 from pipelines.exports.texture.photos import Photos, colors_at, sharpness, softened
 
 Floats = NDArray[np.floating[Any]]
@@ -29,10 +29,6 @@ _UNLIKE = 0.15
 _ROUNDS = 12
 _NEIGHBOURS_WEIGHT = 1.5
 """What a neighbour's choice is worth beside having the best picture, which is worth 1."""
-
-# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
-_core: Any = open3d.core
-_tensor_geometry: Any = open3d.t.geometry
 
 
 @dataclass
@@ -76,29 +72,16 @@ class Surface:
         self._lifted_centers = self.centers + lift[:, None] * self.face_normals
         typical = float(np.median(lift)) if len(lift) else 0.0
         self._lifted_vertices = vertices + typical * normals
-        self._scene = _tensor_geometry.RaycastingScene()
-        self._scene.add_triangles(
-            _core.Tensor(np.ascontiguousarray(vertices, np.float32)),
-            _core.Tensor(np.ascontiguousarray(faces, np.uint32)),
-        )
+        self._sight = Sight(vertices, faces)
 
     def unhindered(self, eye: Floats, faces: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which of some faces an eye sees whole: their middle and their three corners."""
         used = np.unique(self.faces[faces])
         seen = np.zeros(len(self.vertices), np.bool_)
-        seen[used] = self._reached(eye, self._lifted_vertices[used])
+        seen[used] = self._sight.reached(eye, self._lifted_vertices[used])
         whole: NDArray[np.bool_] = np.all(seen[self.faces[faces]], axis=1)
-        whole[whole] = self._reached(eye, self._lifted_centers[faces[whole]])
+        whole[whole] = self._sight.reached(eye, self._lifted_centers[faces[whole]])
         return whole
-
-    def _reached(self, eye: Floats, targets: Floats) -> NDArray[np.bool_]:
-        """Whether nothing lies between an eye [3] and targets [N, 3]."""
-        if len(targets) == 0:
-            return np.zeros(0, np.bool_)
-        rays = np.concatenate([np.broadcast_to(eye, targets.shape), targets - eye], axis=1)
-        hidden = self._scene.test_occlusions(_core.Tensor(rays.astype(np.float32)), 0.0, 0.999)
-        free: NDArray[np.bool_] = ~hidden.numpy()
-        return free
 
 
 def choose_photos(

@@ -1,0 +1,199 @@
+"""A fused mesh moved onto what the photos agree on, a fraction of a voxel.
+
+Depth is fused at the voxels' and the rendered pictures' resolution; photos are finer. Each vertex
+asks the photos that see it how far along its normal they agree best
+(`pipelines.nerf.stereo.refinement`), first in photos of half the size, then in whole ones. Answers
+are believed by how clear they are and by how well they fit the neighbours': the offsets solve
+
+    min_d  sum_i t_i (d_i - o_i)^2 + s sum_edges (d_i - d_j)^2
+
+with t the trust, less where an answer is far from the solution, and s falling from 16 to 1/2: first
+whole regions move, then details. Where photos say nothing, vertices go with their neighbours.
+Vertices on sharp edges and open borders stay: there a patch on the tangent shows two things.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.linalg import cg
+
+from pipelines.exports.mesh import TriangleMesh, unit_normals
+from pipelines.exports.surface.sight import Sight
+from pipelines.nerf.stereo.refinement import Offsets, Pictures, photo_offsets
+from pipelines.nerf.stereo.views import StereoView
+
+Floats = NDArray[np.float64]
+
+_ROUNDS = ((2, 5), (1, 4))
+"""Photos reduced by so much, looked at so many half pixels to each side."""
+_STIFFNESS = (16.0, 8.0, 4.0, 2.0, 1.0, 0.5)
+_HOLD = 1e-3
+"""A vertex of which nothing is known, nor of any neighbour, stays."""
+_HOLD_SHARP = 1.0
+_STRAIGHT, _BENT = 0.9, 0.75
+"""Length of the mean normal around a vertex: on a surface, and on the edge of a box."""
+_CLEAR = 0.3
+_NORMAL_ROUNDS = 2
+_LEAST_VIEWS = 2
+_SIGHT_SHARE, _POINTS_SHARE = 0.3, 0.5
+_ITERATIONS, _TOLERANCE = 200, 1e-4
+
+
+def refined(
+    mesh: TriangleMesh,
+    views: Sequence[StereoView],
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> TriangleMesh:
+    """The mesh with its vertices moved and without what no two views show.
+
+    Colours stay. views: undistorted grey photos with their cameras, in the mesh's world.
+    on_progress: told the share that is done; may raise.
+    """
+    if len(mesh.faces) == 0 or not views:
+        return mesh
+    origin = mesh.vertices.mean(axis=0)
+    vertices = mesh.vertices - origin
+    around = _neighbours(mesh.faces, len(vertices))
+    sharp = _sharpness(vertices, mesh.faces, around)
+    for index, (factor, num_steps) in enumerate(_ROUNDS):
+        normals = vertex_normals(vertices, mesh.faces)
+
+        def on_view(done: float, before: int = index) -> None:
+            on_progress((before + _SIGHT_SHARE * done) / len(_ROUNDS))
+
+        def on_point(done: float, before: int = index) -> None:
+            on_progress((before + _SIGHT_SHARE + _POINTS_SHARE * done) / len(_ROUNDS))
+
+        seen = _seen(vertices, normals, mesh.faces, views, origin, on_view)
+        smooth = _smoothed(normals, around)
+        pictures = Pictures.of([view.reduced(factor) for view in views], origin)
+        offsets = photo_offsets(vertices, smooth, seen, pictures, num_steps, on_progress=on_point)
+        moves = _agreed(offsets, around, _edge_lengths(vertices, around), sharp)
+        vertices = vertices + moves[:, None] * smooth
+        on_progress((index + 1) / len(_ROUNDS))
+    moved = replace(mesh, vertices=vertices + origin, normals=vertex_normals(vertices, mesh.faces))
+    return moved.with_faces(_shown_faces(mesh.faces, seen, around))
+
+
+def _shown_faces(
+    faces: NDArray[np.int32], seen: NDArray[np.uint8], around: csr_array
+) -> NDArray[np.int32]:
+    """The faces that have a corner which enough views show, or which is next to one that they do.
+
+    What is fused behind a surface, where it ends for all cameras, was never looked at: more than
+    half of it is wrong. A mesh of which nothing is shown stays.
+    """
+    shown = (seen.sum(axis=0, dtype=np.int32) >= _LEAST_VIEWS).astype(np.float64)
+    near = (shown + around @ shown) > 0.0
+    kept = near[faces].any(axis=1)
+    return faces[kept] if kept.any() else faces
+
+
+def vertex_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
+    """[V, 3], unit: the mean of the faces around each, by area."""
+    across = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
+    total = np.zeros_like(vertices)
+    for corner in range(3):
+        for axis in range(3):
+            total[:, axis] += np.bincount(faces[:, corner], across[:, axis], len(vertices))
+    return unit_normals(total)
+
+
+def _neighbours(faces: NDArray[np.int32], count: int) -> csr_array:
+    """[V, V]: 1 where an edge is."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
+    found = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
+    found.data[:] = 1.0
+    return found
+
+
+def _edge_lengths(vertices: Floats, around: csr_array) -> Floats:
+    """[V]: the mean length of the edges at each vertex."""
+    pairs = around.tocoo()
+    length = np.linalg.norm(vertices[pairs.row] - vertices[pairs.col], axis=1)
+    count = np.bincount(pairs.row, minlength=len(vertices))
+    total = np.bincount(pairs.row, length, len(vertices))
+    mean: Floats = total / np.maximum(count, 1)
+    return mean
+
+
+def _smoothed(normals: Floats, around: csr_array) -> Floats:
+    """Normals with their neighbours' mean: a fused surface's own are noisy."""
+    count = np.maximum(np.asarray(around.sum(axis=1)).ravel(), 1.0)[:, None]
+    for _ in range(_NORMAL_ROUNDS):
+        normals = unit_normals(normals + (around @ normals) / count)
+    return normals
+
+
+def _seen(
+    vertices: Floats,
+    normals: Floats,
+    faces: NDArray[np.int32],
+    views: Sequence[StereoView],
+    origin: Floats,
+    on_view: Callable[[float], None],
+) -> NDArray[np.uint8]:
+    """[N, V]: 1 where a view shows a vertex from its front, with nothing before it."""
+    sight = Sight(vertices, faces)
+    edges = vertices[faces[:, 0]] - vertices[faces[:, 1]]
+    lifted = vertices + 0.5 * float(np.median(np.linalg.norm(edges, axis=1))) * normals
+    seen = np.zeros((len(views), len(vertices)), np.uint8)
+    for index, view in enumerate(views):
+        _, shown = view.seen(vertices + origin)
+        eye = view.center - origin
+        shown &= ((eye - vertices) * normals).sum(axis=1) > 0.0
+        which = np.flatnonzero(shown)
+        seen[index, which] = sight.reached(eye, lifted[which])
+        on_view((index + 1) / len(views))
+    return seen
+
+
+def _sharpness(vertices: Floats, faces: NDArray[np.int32], around: csr_array) -> Floats:
+    """[V] in [0, 1]: 0 where the surface is about flat, 1 at its edges and open borders."""
+    across = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
+    total, area = np.zeros_like(vertices), np.zeros(len(vertices))
+    for corner in range(3):
+        area += np.bincount(faces[:, corner], np.linalg.norm(across, axis=1), len(vertices))
+        for axis in range(3):
+            total[:, axis] += np.bincount(faces[:, corner], across[:, axis], len(vertices))
+    for _ in range(_NORMAL_ROUNDS):
+        total, area = total + around @ total, area + around @ area
+    straight = np.linalg.norm(total, axis=1) / np.maximum(area, 1e-30)
+    sharp: Floats = np.clip((_STRAIGHT - straight) / (_STRAIGHT - _BENT), 0.0, 1.0)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    pairs, counts = np.unique(edges, axis=0, return_counts=True)
+    sharp[pairs[counts == 1]] = 1.0
+    return sharp
+
+
+def _agreed(offsets: Offsets, around: csr_array, lengths: Floats, sharp: Floats) -> Floats:
+    """The moves [V] that fit those offsets that are believed, and each other."""
+    wanted, trust = offsets.length.astype(np.float64), offsets.trust * (1.0 - sharp)
+    hold = _HOLD + _HOLD_SHARP * sharp
+    clear = trust > _CLEAR
+    if not clear.any():
+        return np.zeros(len(wanted))
+    in_edges = np.abs(wanted[clear]) / lengths[clear]
+    typical = float(np.median(in_edges)) * lengths + 1e-30
+    degree = np.asarray(around.sum(axis=1)).ravel()
+    stiff: Any = diags_array(degree) - around
+    weights, found = trust, np.zeros(len(wanted))
+    for stiffness in _STIFFNESS:
+        matrix = (diags_array(weights + hold) + stiffness * stiff).tocsr()
+        scale = diags_array(1.0 / matrix.diagonal())
+        found, _ = cg(
+            matrix, weights * wanted, x0=found, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=scale
+        )
+        weights = trust / (1.0 + ((found - wanted) / typical) ** 2)
+    return found

@@ -1,0 +1,35 @@
+"""What of a mesh an eye sees with nothing in the way."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import open3d
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+
+# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
+_core: Any = open3d.core
+_tensor_geometry: Any = open3d.t.geometry
+
+
+class Sight:
+    """A mesh that hides what lies behind it. vertices: [V, 3]. faces: [F, 3]."""
+
+    def __init__(self, vertices: Floats, faces: NDArray[np.integer[Any]]) -> None:
+        self._scene = _tensor_geometry.RaycastingScene()
+        self._scene.add_triangles(
+            _core.Tensor(np.ascontiguousarray(vertices, np.float32)),
+            _core.Tensor(np.ascontiguousarray(faces, np.uint32)),
+        )
+
+    def reached(self, eye: Floats, targets: Floats) -> NDArray[np.bool_]:
+        """Whether nothing lies between an eye [3] and targets [N, 3]."""
+        if len(targets) == 0:
+            return np.zeros(0, np.bool_)
+        rays = np.concatenate([np.broadcast_to(eye, targets.shape), targets - eye], axis=1)
+        hidden = self._scene.test_occlusions(_core.Tensor(rays.astype(np.float32)), 0.0, 0.999)
+        free: NDArray[np.bool_] = ~hidden.numpy()
+        return free
