@@ -28,7 +28,7 @@ from typing import Any
 
 from pipelines.errors import Cancelled, PipelineError, ResourceError
 from pipelines.options import resolve_options, stage_options, stages_skipped
-from pipelines.registry import STAGES, get_stage, load_function
+from pipelines.registry import STAGES, get_stage, load_explainer, load_function
 from pipelines.stage import REPORT, Memory, ProgressSink, Stage, StageContext
 from pipelines.workspace import MANIFEST, Workspace
 
@@ -234,6 +234,7 @@ def run_stage(
     except BaseException as error:
         if isinstance(error, PipelineError) and not isinstance(error, Cancelled):
             _keep_report(out, workspace.failed(stage.name))
+            _explain(stage, workspace, error, hooks.logger)
         shutil.rmtree(out, ignore_errors=True)
         raise
     shutil.rmtree(checkpoint, ignore_errors=True)
@@ -252,6 +253,18 @@ def _keep_report(out: Path, target: Path) -> None:
         with contextlib.suppress(OSError):  # a full disk must not hide why the stage failed
             target.mkdir(parents=True, exist_ok=True)
             os.replace(out / REPORT, target / REPORT)
+
+
+def _explain(
+    stage: Stage, workspace: Workspace, error: PipelineError, logger: logging.Logger
+) -> None:
+    """Let the stage's explainer say more of a failure."""
+    try:
+        explainer = load_explainer(stage)
+        if explainer is not None:
+            error.details["check"] = explainer(workspace, stage.name, error.as_dict())
+    except Exception:
+        logger.warning("no more could be said of the failure of %s", stage.name, exc_info=True)
 
 
 def _remove(folder: Path) -> None:

@@ -114,6 +114,13 @@ class PosesOptions(StageOptions):
         le=1000,
         description="Below this number of registered images the job fails.",
     )
+    min_baseline_deg: float = Field(
+        2.0,
+        ge=0,
+        le=90,
+        description="Below this angle between the directions that the same point is seen from (the "
+        "median) depth is not determined, and the job fails. Unit: degrees.",
+    )
     retry_below_ratio: float = Field(
         0.8,
         ge=0,
@@ -134,6 +141,30 @@ class PosesOptions(StageOptions):
         le=1_000_000,
         description="Memory for finding features: where large images would take more, fewer are "
         "worked on at a time. Unit: 10^6 bytes.",
+    )
+
+
+class CheckOptions(StageOptions):
+    """The capture report: how it was filmed."""
+
+    good_ratio: float = Field(
+        0.9,
+        ge=0,
+        le=1,
+        description="Below this share of pictures with a pose a capture is not called good.",
+    )
+    usable_ratio: float = Field(
+        0.6,
+        ge=0,
+        le=1,
+        description="Below this share it is called poor.",
+    )
+    num_pictures: int = Field(
+        36,
+        ge=0,
+        le=200,
+        description="Pictures shown on the page, evenly picked; besides one of each stretch that "
+        "was lost.",
     )
 
 
@@ -244,6 +275,7 @@ STAGE_OPTIONS: types.MappingProxyType[str, type[StageOptions]] = types.MappingPr
         "ingest": IngestOptions,
         "frames": FramesOptions,
         "poses": PosesOptions,
+        "check": CheckOptions,
         "depth": DepthOptions,
         "draft": DraftOptions,
         "train": TrainOptions,
@@ -279,6 +311,13 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
     {
         preset.name: preset
         for preset in (
+            Preset(
+                "check",
+                "Is the capture any good? Its poses and how it was filmed, in a minute or two: "
+                "nothing is made of it.",
+                _SMALL_PICTURES,
+                without=frozenset({"depth", "draft", "train", "evaluate", *KINDS, "assess"}),
+            ),
             Preset(
                 "draft",
                 "A mesh from depth maps alone, in a minute or two on a laptop: nothing is trained.",

@@ -8,12 +8,20 @@ no use for follows from what its importer brings; a preset may leave out more (`
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 from pipelines.captures.catalogue import importer_of
 from pipelines.captures.importer import Brings
 from pipelines.exports.catalogue import EXPORTS, KINDS
 from pipelines.exports.export import Export
-from pipelines.stage import Artifact, Stage, StageFunction
+from pipelines.stage import (
+    CAPTURE_PAGE,
+    CAPTURE_REPORT,
+    Artifact,
+    FailureExplainer,
+    Stage,
+    StageFunction,
+)
 
 
 def _export_stage(export: Export) -> Stage:
@@ -31,6 +39,9 @@ def _export_stage(export: Export) -> Stage:
     )
 
 
+_EXPLAINS = "pipelines.stages.check:write_failed_check"
+"""What makes the capture report of a job that ends before `check` has."""
+
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
@@ -39,6 +50,7 @@ STAGES: tuple[Stage, ...] = (
         reads=(),
         run="pipelines.stages.ingest:run",
         options="IngestOptions",
+        explains=_EXPLAINS,
         time_limit_s=1800.0,
     ),
     Stage(
@@ -48,17 +60,32 @@ STAGES: tuple[Stage, ...] = (
         reads=("ingest",),
         run="pipelines.stages.frames:run",
         options="FramesOptions",
+        explains=_EXPLAINS,
         time_limit_s=3600.0,
     ),
     Stage(
         name="poses",
-        version=4,
+        version=5,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",
         options="PosesOptions",
+        explains=_EXPLAINS,
         time_limit_s=6 * 3600.0,
         stall_s=2 * 3600.0,  # one bundle adjustment of many pictures may be long and silent
+    ),
+    Stage(
+        name="check",
+        version=1,
+        after=("poses",),
+        reads=("ingest", "frames", "poses"),
+        run="pipelines.stages.check:run",
+        options="CheckOptions",
+        time_limit_s=1800.0,
+        artifacts=(
+            Artifact(CAPTURE_REPORT, CAPTURE_REPORT, "application/json", "any text editor"),
+            Artifact(CAPTURE_PAGE, CAPTURE_PAGE, "text/html", "any browser"),
+        ),
     ),
     Stage(
         name="depth",
@@ -67,6 +94,7 @@ STAGES: tuple[Stage, ...] = (
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.depth:run",
         options="DepthOptions",
+        explains=_EXPLAINS,
         time_limit_s=6 * 3600.0,
         artifacts=(Artifact("depth.jpg", "depth.jpg", "image/jpeg", "any picture viewer"),),
     ),
@@ -124,12 +152,13 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="report",
-        version=3,
-        after=("draft", "evaluate", *KINDS, "assess"),
+        version=4,
+        after=("check", "draft", "evaluate", *KINDS, "assess"),
         reads=(
             "ingest",
             "frames",
             "poses",
+            "check",
             "depth",
             "draft",
             "train",
@@ -166,6 +195,17 @@ def skipped_stages(kind: str) -> frozenset[str]:
 
 def load_function(stage: Stage) -> StageFunction:
     """Import the stage's code: call it only in the process that runs the stage."""
-    module_name, _, function_name = stage.run.partition(":")
-    function: StageFunction = getattr(importlib.import_module(module_name), function_name)
+    function: StageFunction = _load(stage.run)
     return function
+
+
+def load_explainer(stage: Stage) -> FailureExplainer | None:
+    """Import what says more of the stage's failures, if anything does; where the stage runs."""
+    explainer: FailureExplainer | None = _load(stage.explains) if stage.explains else None
+    return explainer
+
+
+def _load(dotted: str) -> Any:
+    """What "module:function" names."""
+    module_name, _, function_name = dotted.partition(":")
+    return getattr(importlib.import_module(module_name), function_name)

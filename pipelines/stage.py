@@ -8,7 +8,7 @@ brings the inputs, publishes the folder and writes its manifest. This file impor
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -18,6 +18,8 @@ from pipelines.workspace import Workspace
 
 REPORT = "report.json"
 """What a stage, or a whole job, says of itself in its own words."""
+CAPTURE_REPORT, CAPTURE_PAGE = "capture-report.json", "capture-report.html"
+"""What a job says of how its capture was filmed."""
 
 
 Memory = Literal["full", "small"]
@@ -53,6 +55,9 @@ class Stage:
     needs_gpu: whether a GPU worker should take it when there is one.
     time_limit_s: hard limit for one attempt.
     stall_s: an attempt that neither gets on nor writes a log line for so long is ended.
+    explains: dotted path of `(workspace, stage's name, error) -> dict`, called where the stage
+        fails: it may say more in `workspace.failed(name)`; what it returns is in the error's
+        details as `check`. Errors of its own are logged and change nothing.
     """
 
     name: str
@@ -65,6 +70,7 @@ class Stage:
     time_limit_s: float = 3600.0
     stall_s: float = 1800.0
     artifacts: tuple[Artifact, ...] = ()
+    explains: str = ""
 
 
 class ProgressSink(Protocol):
@@ -129,6 +135,9 @@ class StageContext:
 
 SMALL_SHARE = 0.25
 """Of what a stage usually takes for passing things, where memory ran out before."""
+
+FailureExplainer = Callable[[Workspace, str, Mapping[str, Any]], dict[str, Any]]
+"""See `Stage.explains`; the error as `PipelineError.as_dict` gives it."""
 
 StageFunction = Callable[[Any, StageContext], dict[str, Any]]
 """`(options, ctx) -> summary`; the summary is JSON-able and ends in the manifest and the report."""

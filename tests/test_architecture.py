@@ -94,6 +94,7 @@ PIPELINE_ROOMS: tuple[tuple[str, ...], ...] = (
     ("tools",),
     ("captures", "sfm", "judging"),
     ("exports",),
+    ("filming",),
     ("stages", "sample"),
 )
 NERF_ROOMS: tuple[tuple[str, ...], ...] = (

@@ -1,5 +1,7 @@
 """`report.json` of a job that failed: written by the worker of the stage that ended it.
 
+Beside it goes the capture report, where the stage's process has left one (`Stage.explains`).
+
 It is published like the files of an attempt that succeeded, below the attempt's own prefix, and
 recorded with the failure. Where that is not possible the job fails without one: the error counts.
 A stage that is lost together with its worker, over and over, leaves none.
@@ -16,7 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipelines.manifest import list_files
 from pipelines.stage import REPORT
-from pipelines.stages.report import write_failed_report
+from pipelines.stages.report import keep_capture_report, write_failed_report
 from pipelines.workspace import Workspace
 from storage.claims import Claim
 from storage.db import Database
@@ -51,6 +53,7 @@ def publish_failure(
             return None
         manifests = {name: found.manifest for name, found in work.inputs.items()}
         write_failed_report(folder / REPORT, workspace, manifests, claim.name, error)
+        keep_capture_report(workspace, claim.name, folder)
         upload_folder(store, folder, prefix, lambda: None, workers=1, step="report")
         return FailureReport(prefix, list_files(folder))
     except (StorageError, SQLAlchemyError, OSError, ValueError, KeyError, TypeError) as problem:

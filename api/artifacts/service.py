@@ -12,11 +12,17 @@ from api.artifacts.schemas import ArtifactView
 from api.deps import Services
 from api.problems import MissingError
 from pipelines.registry import STAGES, get_stage
-from pipelines.stage import REPORT, Artifact
+from pipelines.stage import CAPTURE_PAGE, CAPTURE_REPORT, REPORT, Artifact
 from storage.models import Job
 from storage.objects_local import LocalObjectStore
 
-(_REPORT,) = (found for found in get_stage("report").artifacts if found.path == REPORT)
+_OF_FAILURES = {
+    found.path: found
+    for name in ("report", "check")
+    for found in get_stage(name).artifacts
+    if found.path in (REPORT, CAPTURE_REPORT, CAPTURE_PAGE)
+}
+"""What a job that failed offers, although the stages that make it did not succeed."""
 _LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
@@ -31,11 +37,12 @@ class Published:
 
 
 def published(job: Job) -> Iterator[Published]:
-    """The artifacts of the job's succeeded stages; of a job that failed, its report, too.
+    """The artifacts of the job's succeeded stages; of a job that failed, its reports, too.
 
     The job is loaded with its manifests.
     """
     rows = {row.name: row for row in job.stages}
+    there: set[str] = set()
     for stage in STAGES:
         row = rows.get(stage.name)
         if row is None or row.state != "succeeded" or not row.output_prefix or not row.manifest:
@@ -45,13 +52,15 @@ def published(job: Job) -> Iterator[Published]:
             entry = files.get(artifact.path)
             if entry is not None:
                 key = row.output_prefix + artifact.path
+                there.add(artifact.name)
                 yield Published(artifact, key, entry["bytes"], entry["sha256"])
     failed = rows.get(str((job.error or {}).get("stage")))
     if failed is not None and failed.state == "failed" and failed.output_prefix:
         for entry in (failed.manifest or {}).get("files", []):
-            if entry["path"] == _REPORT.path:
-                key = failed.output_prefix + _REPORT.path
-                yield Published(_REPORT, key, entry["bytes"], entry["sha256"])
+            known = _OF_FAILURES.get(entry["path"])
+            if known is not None and known.name not in there:
+                key = failed.output_prefix + known.path
+                yield Published(known, key, entry["bytes"], entry["sha256"])
 
 
 def find(job: Job, name: str) -> Published:

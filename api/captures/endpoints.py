@@ -7,27 +7,36 @@ from contextlib import ExitStack
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi import Body as JsonBody
 from starlette.requests import ClientDisconnect
 
 from api.captures import service
 from api.captures.receiving import Body, Limits, receive, staging_file
 from api.captures.schemas import CapturePage, CaptureView
+from api.codes import BODY as JSON_BODY
 from api.codes import CAPTURE, ONCE, UPLOAD
 from api.deps import CallerDep, ServicesDep
 from api.errors import responses
 from api.idempotency import IdempotencyKey, Once
 from api.ids import CaptureId
+from api.jobs.endpoints import LINKS as JOB_LINKS
+from api.jobs.endpoints import POLL_S
+from api.jobs.schemas import CheckRequest, JobRequest, JobView
+from api.jobs.service import create as create_job
 from api.problems import ApiError
 from storage import queries, records
 
 PATH = "/v1/captures"
 CLIENT_WENT_AWAY = 499
+CHECK = "check"
+"""The preset that finds poses, judges the capture by them, and ends there."""
 router = APIRouter(prefix=PATH, tags=["captures"])
 
 MADE = "$response.body#/id"
 LINKS = {
     "get_capture": {"operationId": "get_capture", "parameters": {"capture_id": MADE}},
     "delete_capture": {"operationId": "delete_capture", "parameters": {"capture_id": MADE}},
+    "check_capture": {"operationId": "check_capture", "parameters": {"capture_id": MADE}},
     "create_job": {"operationId": "create_job", "requestBody": {"capture_id": MADE}},
 }
 _UPLOAD_SCHEMA = {
@@ -102,6 +111,41 @@ def get_capture(capture_id: CaptureId, services: ServicesDep) -> CaptureView:
     """One capture."""
     with services.database.read_scope() as session:
         return CaptureView.of(records.get_capture(session, capture_id))
+
+
+@router.post(
+    "/{capture_id}/check",
+    status_code=202,
+    responses={
+        **responses("capture_not_found", "options_invalid", *JSON_BODY, *ONCE),
+        202: {"links": JOB_LINKS},
+    },
+    response_model=JobView,
+)
+def check_capture(
+    capture_id: CaptureId,
+    services: ServicesDep,
+    caller: CallerDep,
+    request: Request,
+    wanted: Annotated[CheckRequest | None, JsonBody()] = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """Is the capture any good? A job that ends after the poses, with preset `check`.
+
+    Poll and cancel it as any other. `check` in its view is the verdict, what it rests on, and what
+    to do better; `capture-report.html` shows it. A job that fails for what the capture is says so
+    there, too.
+    """
+    wanted = wanted or CheckRequest()
+    once = Once.of(
+        caller, f"POST {PATH}/{capture_id}/check", idempotency_key, wanted.model_dump_json()
+    )
+    job = JobRequest(
+        capture_id=capture_id, preset=CHECK, options=wanted.options, labels=wanted.labels
+    )
+    answer = create_job(services, job, once, request)
+    answer.headers["Retry-After"] = POLL_S
+    return answer
 
 
 @router.delete(

@@ -3,6 +3,7 @@
     nerfworks up                      keep the service running from this folder
     nerfworks submit FILE             upload, start a job; --wait and --download go on to the end
     nerfworks submit --capture ID     the same on a capture that is there
+    nerfworks check FILE              is it any good? verdict, reasons, what to do better; no more
     nerfworks status | watch | logs | download [JOB]     the newest job where none is named
     nerfworks events [JOB]            what happened to it: when, who, why
     nerfworks retry JOB               once more, from what failed or what --set changes
@@ -14,7 +15,8 @@
 With --json a command prints one JSON document on the standard output, and all else on the standard
 error output.
 
-Exit status: 0 done, 1 the job failed or the call was refused, 2 wrong usage, 3 no service reached.
+Exit status: 0 done, 1 the job failed, the call was refused, or the capture is unusable, 2 wrong
+usage, 3 no service reached.
 Ctrl-C while watching leaves the job running.
 """
 
@@ -43,6 +45,7 @@ from api.client.client import (
 from api.client.display import (
     clean,
     print_captures,
+    print_check,
     print_error,
     print_events,
     print_job,
@@ -125,6 +128,14 @@ def _print_json(found: BaseModel | list[BaseModel]) -> None:
     print(json.dumps(shown if isinstance(found, list) else shown[0], indent=1))
 
 
+def _check_source(args: argparse.Namespace) -> None:
+    """One capture must be named, and a file must be there."""
+    if (args.file is None) == (args.capture is None):
+        raise UsageError("Name a FILE, or a capture that is there: --capture ID.")
+    if args.file is not None and not Path(args.file).is_file():
+        raise UsageError(f"There is no file {args.file}.")
+
+
 def _sent(client: Client, args: argparse.Namespace, console: Console) -> str:
     """The capture to work on: the one that was named, or the file, uploaded. Returns its id."""
     if args.capture is not None:
@@ -139,10 +150,7 @@ def _sent(client: Client, args: argparse.Namespace, console: Console) -> str:
 def submit(client: Client, args: argparse.Namespace, console: Console) -> int:
     """Upload a capture, or take one that is there, and start a job."""
     options, labels = _options(args.set), _labels(args.label)
-    if (args.file is None) == (args.capture is None):
-        raise UsageError("Name a FILE, or a capture that is there: --capture ID.")
-    if args.file is not None and not Path(args.file).is_file():
-        raise UsageError(f"There is no file {args.file}.")
+    _check_source(args)
     client.validate(args.preset, options, labels)  # before minutes of upload
     job = client.create_job(_sent(client, args, console), args.preset, options, labels)
     console.print(
@@ -157,6 +165,31 @@ def submit(client: Client, args: argparse.Namespace, console: Console) -> int:
     if args.json:
         _print_json(client.get_job(job.id))
     return ended
+
+
+def check(client: Client, args: argparse.Namespace, console: Console) -> int:
+    """Look how well a capture was filmed, and say what to do better; nothing is made of it."""
+    options, labels = _options(args.set), _labels(args.label)
+    _check_source(args)
+    client.validate("check", options, labels)
+    job = client.start_check(_sent(client, args, console), options, labels)
+    try:
+        job = watch_job(client, job.id, console)
+    except KeyboardInterrupt:
+        console.print(f"\nThe job goes on. See it again: nerfworks watch {job.id}")
+        return INTERRUPTED
+    if args.json:
+        _print_json(job)
+    if job.check is None:
+        print_error(job, console)
+        return FAILED
+    print_check(job.check, console)
+    if args.download is not None and job.artifacts:
+        for path in _download(client, job.id, Path(args.download), console):
+            console.print(clean(str(path)), highlight=False, soft_wrap=True)
+    elif job.artifacts:
+        console.print(f"With pictures: nerfworks download {job.id}", highlight=False)
+    return FAILED if job.state != "succeeded" or job.check.verdict == "unusable" else OK
 
 
 def status(client: Client, args: argparse.Namespace, console: Console) -> int:
@@ -341,6 +374,15 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     one.add_argument("--wait", action="store_true", help="show the job until it is over")
     one.add_argument("--download", metavar="DIR", help="wait, then download the results there")
     as_json = [one, command("status", status, "newest")]
+    one = command("check", check)
+    one.add_argument(
+        "file", nargs="?", metavar="FILE", help="a video, or a .zip of photos or an app export"
+    )
+    one.add_argument("--capture", metavar="ID", help="a capture that was uploaded before")
+    one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
+    one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
+    one.add_argument("--download", metavar="DIR", help="download the reports there")
+    as_json.append(one)
     command("watch", watch, "newest")
     one = command("logs", logs, "newest")
     one.add_argument("--stage", help="only this stage")

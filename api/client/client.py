@@ -24,6 +24,7 @@ from api.client.models import (
     ApiProblem,
     Artifact,
     Capture,
+    Check,
     ChecksumMismatch,
     ConnectionFailed,
     Event,
@@ -58,6 +59,7 @@ __all__ = [
     "ApiProblem",
     "Artifact",
     "Capture",
+    "Check",
     "ChecksumMismatch",
     "Client",
     "ConnectionFailed",
@@ -156,6 +158,37 @@ class Client:
     def delete_capture(self, capture_id: str) -> None:
         """Delete a capture and its bytes."""
         self._delete(f"/v1/captures/{segment(capture_id)}")
+
+    def start_check(
+        self,
+        capture_id: str,
+        options: dict[str, Any] | None = None,
+        labels: dict[str, str] | None = None,
+        *,
+        idempotency_key: str | None = None,
+    ) -> Job:
+        """Start a job that looks how well a capture was filmed, and makes nothing of it."""
+        wanted = {"options": options or {}, "labels": labels or {}}
+        path, once = f"/v1/captures/{segment(capture_id)}/check", once_header(idempotency_key)
+        answer = self._wire.send(lambda: self._wire.http.post(path, json=wanted, headers=once))
+        return Job.model_validate(checked(answer).json())
+
+    def check(
+        self,
+        capture_id: str,
+        options: dict[str, Any] | None = None,
+        timeout: float | None = None,
+        on_update: Callable[[Job], None] | None = None,
+    ) -> Check:
+        """How well a capture was filmed, and what to do better: within minutes.
+
+        A capture that cannot be used is no error here: its verdict is `unusable`. Raises JobFailed
+        where the job ended without a word on the capture, WaitTimedOut after `timeout` seconds.
+        """
+        job = self.wait(self.start_check(capture_id, options).id, on_update, timeout)
+        if job.check is None:
+            raise JobFailed(job)
+        return job.check
 
     # Jobs
 

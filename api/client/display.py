@@ -22,7 +22,7 @@ from rich.progress import (
 from rich.table import Table
 
 from api.client.client import Artifact, Capture, Client, Job, Stage
-from api.client.models import Event
+from api.client.models import Check, Event
 
 PLAIN_EVERY_S = 15.0
 _STYLES = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}
@@ -332,6 +332,23 @@ def result_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
         for name, value in result.items()
         if isinstance(value, str | int | float)
     ]
+
+
+_VERDICT_STYLES = {"good": "green", "usable": "yellow", "poor": "yellow", "unusable": "red"}
+
+
+def print_check(check: Check, console: Console | None = None) -> None:
+    """How a capture was filmed: the verdict, what it rests on, and what to do next time."""
+    console = console or Console()
+    verdict = clean(check.verdict or "not judged")
+    style = _VERDICT_STYLES.get(check.verdict or "", "default")
+    console.print(f"The capture is [bold {style}]{verdict}[/].", highlight=False)
+    for reason in check.reasons:
+        console.print(f"  {clean(reason)}", highlight=False)
+    if check.advice:
+        console.print("What to do next time:", highlight=False)
+    for advice in check.advice:
+        console.print(f"  - {clean(advice)}", highlight=False)
 
 
 def print_results(

@@ -70,6 +70,17 @@ class JobError(_Model):
     details: dict[str, Any] = Field(default_factory=dict)
 
 
+class Check(_Model):
+    """How a capture was filmed. verdict: good, usable, poor, unusable, or None where nobody knows.
+
+    reasons: what decides it. advice: what to do next time, the most useful first.
+    """
+
+    verdict: str | None
+    reasons: list[str]
+    advice: list[str]
+
+
 class Artifact(_Model):
     """A file that a job offers. url: signed, good for a short while, needs no key."""
 
@@ -118,6 +129,7 @@ class Job(_Model):
     stages: list[Stage]
     metrics: dict[str, float | int | None] | None
     assets: dict[str, Any] | None = None
+    check: Check | None = None
     error: JobError | None
     created_at: datetime
     started_at: datetime | None

@@ -14,6 +14,7 @@ from pipelines.registry import STAGE_NAMES
 from storage.models import Job, StageRow
 
 _METRICS = ("psnr", "ssim", "lpips", "num_images", "width", "height")
+_CHECK = ("verdict", "reasons", "advice")
 _ASSETS = ("mesh", "cloud", "depth", "depth_agreement", "warnings")
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
@@ -78,6 +79,22 @@ class JobPlan(BaseModel):
     )
 
 
+class CheckRequest(BaseModel):
+    """How to check a capture: with the options and labels of a job with preset `check`."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [{}, {"options": {"poses": {"min_registered_ratio": 0.5}}}],
+        },
+    )
+
+    options: JsonObject = Field(
+        default_factory=dict, description="{stage: {option: value}}, laid over preset `check`."
+    )
+    labels: Labels = Field(default_factory=dict, description="Free text to find the job by.")
+
+
 class RetryRequest(BaseModel):
     """What to do differently when a job is run again."""
 
@@ -108,6 +125,16 @@ class JobErrorView(BaseModel):
     hint: str
     stage: str | None = Field(None, description="The stage that failed.")
     details: dict[str, Any] = Field(default_factory=dict)
+
+
+class CheckView(BaseModel):
+    """How the capture was filmed; `capture-report.json` has the whole."""
+
+    verdict: Literal["good", "usable", "poor", "unusable"] | None = Field(
+        description="null where the job ended too early to say, and not for what the capture is."
+    )
+    reasons: list[str] = Field(description="What was measured that decides it.")
+    advice: list[str] = Field(description="What to do next time, the most useful first.")
 
 
 class StageView(BaseModel):
@@ -158,6 +185,9 @@ class JobSummary(BaseModel):
         description="The delivered mesh and cloud against held-out photos, once measured: mesh and "
         "cloud {coverage, psnr, ssim, psnr_with_holes}, warnings [{code, message, hint}]."
     )
+    check: CheckView | None = Field(
+        None, description="How the capture was filmed, once that is known; also of a failed job."
+    )
     error: JobErrorView | None
     created_at: datetime
     started_at: datetime | None
@@ -180,6 +210,7 @@ class JobSummary(BaseModel):
             "stages": [StageView.model_validate(row) for row in job.stages],
             "metrics": metrics_of(job.stages),
             "assets": assets_of(job.stages),
+            "check": check_of(job),
             "error": None if job.error is None else JobErrorView.model_validate(job.error),
             "created_at": job.created_at,
             "started_at": job.started_at,
@@ -262,3 +293,12 @@ def assets_of(stages: list[StageRow]) -> dict[str, Any] | None:
         if row.name == "assess" and row.state == "succeeded" and row.summary:
             return {key: row.summary[key] for key in _ASSETS if key in row.summary}
     return None
+
+
+def check_of(job: Job) -> dict[str, Any] | None:
+    """How the capture was filmed, from its check, or else from what a failed stage said of it."""
+    for row in job.stages:
+        if row.name == "check" and row.state == "succeeded" and row.summary:
+            return {key: row.summary[key] for key in _CHECK}
+    found: dict[str, Any] | None = (job.error or {}).get("details", {}).get("check")
+    return found

@@ -13,6 +13,7 @@ from typing import Any
 
 from pipelines.errors import PipelineError, PosesError
 from pipelines.options import PosesOptions
+from pipelines.scene.orientation import normalise, opengl_from_opencv
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings
 from pipelines.sfm.rungs import RUNGS, Rung
 from pipelines.sfm.source import Source
@@ -24,8 +25,7 @@ MIN_FEATURES = 100
 MIN_INLIERS = 30
 """Verified matches with its best partner below which an image is rarely placed (COLMAP's
 abs_pose_min_num_inliers)."""
-MIN_ANGLE_DEG = 2.0
-"""Median triangulation angle below which depth is not determined; COLMAP drops points < 1.5."""
+_MAX_POINTS_SHOWN = 1500
 _MOVE_HINT = (
     "Move sideways around the subject while filming: turning on the spot, or holding still, "
     "shows nothing of depth."
@@ -114,7 +114,7 @@ def check_usable(outcome: Outcome, source: Source, options: PosesOptions) -> Spa
             details=details,
         )
     if model is not None and placed >= needed:
-        if model.angle_deg >= MIN_ANGLE_DEG:
+        if model.angle_deg >= options.min_baseline_deg:
             return model
         raise PosesError(
             f"The camera hardly moved: the same point is seen from directions only "
@@ -146,6 +146,27 @@ def unregistered_images(outcome: Outcome, source: Source) -> list[dict[str, Any]
             code, reason = _reason(index, others, outcome.statistics)
             entries.append({"file": file, "timestamp_s": seconds, "code": code, "reason": reason})
     return entries
+
+
+def images_seen(outcome: Outcome, source: Source) -> list[dict[str, Any]]:
+    """For each image: file, num_features, best_inliers (verified matches with its best partner),
+    and group: which of the chosen attempt's models holds it, 0 for the chosen one, None for none.
+    """
+    models = sorted(outcome.chosen.models, key=lambda found: found is not outcome.chosen.best)
+    group: dict[int, int] = {}
+    for number, model in enumerate(models):
+        for index in model.indices:
+            group.setdefault(index, number)
+    found = outcome.statistics
+    return [
+        {
+            "file": file,
+            "num_features": int(found.num_features[index]),
+            "best_inliers": int(found.best_inliers[index]),
+            "group": group.get(index),
+        }
+        for index, file in enumerate(source.files)
+    ]
 
 
 def _reason(index: int, others: dict[int, int], statistics: PairStatistics) -> tuple[str, str]:
@@ -216,6 +237,7 @@ def build_report(outcome: Outcome, source: Source) -> dict[str, Any]:
         },
         "unregistered": unregistered_images(outcome, source),
         "gaps_s": gaps(outcome, source),
+        "images": images_seen(outcome, source),
     }
 
 
@@ -247,12 +269,31 @@ def report_of_failure(
     report = build_report(outcome, source)
     reasons = Counter(entry["code"] for entry in report["unregistered"])
     failure = {key: error.as_dict()[key] for key in ("code", "message", "hint", "details")}
+    model = outcome.chosen.best
     return {
         **report,
+        "median_triangulation_angle_deg": None if model is None else model.angle_deg,
+        "placed": None if model is None else _placed(model, source),
         "num_needed": num_needed(len(source.files), options),
         "error": failure,
         "reasons": dict(reasons),
         "advice": [error.hint, *(_ADVICE[code] for code, _ in reasons.most_common())],
+    }
+
+
+def _placed(model: SparseModel, source: Source) -> dict[str, Any]:
+    """The poses of a model that is not good enough, and some of its points, to be looked at.
+
+    files; poses: [N][3][4], OpenGL axes, as the world of `cameras.json` would be; points, colors.
+    """
+    poses = opengl_from_opencv(model.world_from_camera)
+    world = normalise(poses).similarity
+    few = slice(None, None, max(1, len(model.points) // _MAX_POINTS_SHOWN))
+    return {
+        "files": [source.files[index] for index in model.indices],
+        "poses": world.apply_to_cameras(poses).round(5).tolist(),
+        "points": world.apply_to_points(model.points[few]).round(4).tolist(),
+        "colors": model.colors[few].tolist(),
     }
 
 

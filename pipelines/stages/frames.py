@@ -2,16 +2,20 @@
 
 Writes `images/frame_00001.jpg`, ... (upright, SDR, reduced) and `frames.json`: `{width, height,
 num_source_frames, warnings, clips: [{name, offset_s, duration_s, width, height, num_frames,
-num_source_frames}], frames: [{file, clip, timestamp_s, source_frame_index, sharpness}]}`.
-Frames of a 360-degree clip lie in `panoramas/`, and the views cut from each in `images/`: its row
-lists them as `views`. Times of several clips run on from one to the next: `offset_s` is where a
-clip's own begin. Each clip is decoded once; of each window only the best frame so far is held.
+num_source_frames}], frames: [{file, clip, timestamp_s, source_frame_index, sharpness, speed,
+gain_ev}]}`. Frames of a 360-degree clip lie in `panoramas/`, and the views cut from each in
+`images/`: its row lists them as `views`. Times of several clips run on from one to the next:
+`offset_s` is where a clip's own begin. speed: how fast the picture moved in the frame's window, the
+median, long sides per second, or null. gain_ev: stops by which exposure changed since the clip's
+first frame, as far as that was seen. Each clip is decoded once; of each window only the best frame
+so far is held.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,6 +26,7 @@ from pipelines.captures.archive_rules import shown
 from pipelines.captures.clips import Clip, clip_file
 from pipelines.captures.hdr import TRANSFERS
 from pipelines.captures.minimum import MIN_IMAGES
+from pipelines.captures.motion import MotionMeter
 from pipelines.captures.panorama_files import FOLDER as PANORAMAS
 from pipelines.captures.panorama_files import write_views
 from pipelines.captures.record import CaptureRecord
@@ -66,6 +71,9 @@ class _Windows:
     _best: Frame | None = None
     _best_sharpness: float = -1.0
     _window: int = -1
+    _meter: MotionMeter = field(default_factory=MotionMeter)
+    _speeds: list[float] = field(default_factory=list)
+    _gain_ev: float = 0.0
 
     def take(self, frame: Frame) -> None:
         """Look at the next frame, in order of time."""
@@ -75,6 +83,11 @@ class _Windows:
         if window != self._window:
             self.flush()
             self._window = window
+        step = self._meter.take(frame)
+        if step is not None and step.speed is not None:
+            self._speeds.append(step.speed)
+        if step is not None and step.gain_ev is not None:
+            self._gain_ev += step.gain_ev
         if self._best is None or sharpness > self._best_sharpness:
             self._best, self._best_sharpness = frame, sharpness
 
@@ -95,12 +108,15 @@ class _Windows:
                 else None,
                 "source_frame_index": frame.index,
                 "sharpness": round(self._best_sharpness, 3),
+                "speed": round(statistics.median(self._speeds), 4) if self._speeds else None,
+                "gain_ev": round(self._gain_ev, 3),
             }
         )
         if self.num_views:
             views = write_views(self.out / file, self.out, stem, self.num_views)
             self.rows[-1]["views"] = views
         self._best, self._best_sharpness = None, -1.0
+        self._speeds.clear()
 
     def _window_of(self, frame: Frame) -> int:
         if self.num_windows == 0 or not math.isfinite(frame.time_s):

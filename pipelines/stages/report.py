@@ -2,7 +2,8 @@
 
 Fixed keys, for programs: state (succeeded, failed), error (null, or stage, code, message, hint,
 details), capture.kind, poses.num_images, poses.num_registered, poses.registered_ratio, poses.metric
-(whether one unit is a metre; null where that is unknown), metrics.psnr, metrics.ssim,
+(whether one unit is a metre; null where that is unknown), check {verdict, reasons, advice} (how the
+capture was filmed; null where nobody looked), metrics.psnr, metrics.ssim,
 metrics.num_images, metrics.width, metrics.height, metrics.per_image[], metrics.protocol
 {name, split, fit_poses, fit_appearance, train_camera_optimizer, train_appearance, description},
 metrics.lpips and metrics.floaters (null with a metrics.lpips_reason or
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,7 @@ from pipelines.errors import ExportError
 from pipelines.manifest import versions
 from pipelines.options import ReportOptions
 from pipelines.registry import STAGE_NAMES, STAGES
-from pipelines.stage import REPORT, StageContext
+from pipelines.stage import CAPTURE_PAGE, CAPTURE_REPORT, REPORT, StageContext
 from pipelines.workspace import MANIFEST, Workspace
 
 REPORT_VERSION = 1
@@ -52,12 +54,14 @@ _METRICS = (
     "floaters_reason",
     "per_image",
 )
+_LONG = ("images", "placed")
+"""What a failed stage says of each picture: that is in the capture report, drawn."""
 _NOTHING_TRAINED: dict[str, Any] = {
     "metrics": None,
     "metrics_reason": "Nothing was trained: there are no held-out numbers.",
     "assets": None,
-    "assets_reason": "The mesh is the draft, from depth maps alone; it was not compared with "
-    "photos.",
+    "assets_reason": "The mesh, if there is one, is the draft, from depth maps alone; it was not "
+    "compared with photos.",
 }
 
 Manifests = dict[str, dict[str, Any]]
@@ -65,10 +69,12 @@ Manifests = dict[str, dict[str, Any]]
 
 def run(options: ReportOptions, ctx: StageContext) -> dict[str, Any]:
     """Write `report.json`. The summary is its headline numbers. Raises ExportError for a missing
-    manifest of a stage that every job has, or every job that trains, or every one that does not."""
+    manifest of a stage that every job has, or every one that trains, drafts, or only checks.
+    """
     del options
     manifests = manifests_of(ctx.workspace)
-    for name in ("ingest", "evaluate") if "train" in manifests else ("ingest", "draft"):
+    last = "evaluate" if "train" in manifests else "draft" if "depth" in manifests else "check"
+    for name in ("ingest", last):
         if name not in manifests:
             raise ExportError(
                 f"The report needs the result of {name}, which is not there.",
@@ -118,6 +124,7 @@ def build_report(
             "warnings": capture.warnings,
         },
         "poses": _poses(manifests, capture),
+        "check": check_of(manifests.get("check", {}).get("summary")),
         **(_quality(manifests) if trains else _NOTHING_TRAINED),
         "warnings": [
             *manifests.get("poses", {}).get("summary", {}).get("warnings", []),
@@ -127,13 +134,18 @@ def build_report(
         "stages": {
             name: item["summary"]
             for name, item in manifests.items()
-            if name not in ("evaluate", "assess")
+            if name not in ("check", "evaluate", "assess")
         },
         "options": {name: item["options"] for name, item in manifests.items()},
         "versions": versions(),
         "seed": next((item.get("seed") for item in manifests.values()), None),
         "artifacts": _artifacts(manifests),
     }
+
+
+def check_of(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What a summary of `check` says of how the capture was filmed."""
+    return None if not found else {key: found[key] for key in ("verdict", "reasons", "advice")}
 
 
 def _quality(manifests: Manifests) -> dict[str, Any]:
@@ -216,11 +228,23 @@ def write_failed_report(
             key: said[key] for key in ("num_images", "num_registered", "registered_ratio", "metric")
         } | {"source": "structure from motion", "advice": said["advice"]}
     shown = {key: error[key] for key in ("code", "message", "hint", "details") if key in error}
+    if report["check"] is None:
+        report["check"] = check_of(error.get("details", {}).get("check"))
+    if said is not None:
+        said = {key: value for key, value in said.items() if key not in _LONG}
     report |= {"state": "failed", "error": {"stage": stage, **shown}, "failed_report": said}
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
     draft.write_text(json.dumps(report, indent=1), "utf-8")
     draft.replace(path)
+
+
+def keep_capture_report(workspace: Workspace, stage: str, folder: Path) -> None:
+    """Copy the capture report that a failed stage left, if it did, into a folder."""
+    for name in (CAPTURE_REPORT, CAPTURE_PAGE):
+        (folder / name).unlink(missing_ok=True)
+        if (workspace.failed(stage) / name).is_file():
+            shutil.copyfile(workspace.failed(stage) / name, folder / name)
 
 
 def write_failed_report_locally(workspace: Workspace, stage: str, error: Mapping[str, Any]) -> Path:
@@ -233,6 +257,7 @@ def write_failed_report_locally(workspace: Workspace, stage: str, error: Mapping
     before = STAGE_NAMES[: STAGE_NAMES.index(stage)]
     manifests = {name: item for name, item in manifests_of(workspace).items() if name in before}
     write_failed_report(folder / REPORT, workspace, manifests, stage, error)
+    keep_capture_report(workspace, stage, folder)
     return folder / REPORT
 
 

@@ -265,7 +265,7 @@ def test_openapi_names_operations_and_the_shape_of_errors(service: Service) -> N
     document = service.anyone.get("/openapi.json").json()
     ids = {call["operationId"] for calls in document["paths"].values() for call in calls.values()}
     assert ids == {
-        *("create_capture", "list_captures", "get_capture", "delete_capture"),
+        *("create_capture", "list_captures", "get_capture", "delete_capture", "check_capture"),
         *("create_export", "list_exports", "list_export_kinds"),
         *(
             "create_job",

@@ -124,7 +124,8 @@ def test_a_draft_has_its_mesh_and_says_why_there_is_no_other(service: Service) -
         artifact["name"]
         for artifact in service.http.get(f"/v1/jobs/{job['id']}").json()["artifacts"]
     ]
-    assert names == ["depth.jpg", "draft.glb", "draft.jpg", "report.json"]
+    assert names[:2] == ["capture-report.json", "capture-report.html"]
+    assert names[2:] == ["depth.jpg", "draft.glb", "draft.jpg", "report.json"]
     answer = service.http.get(f"/v1/jobs/{job['id']}/artifacts/mesh.glb")
     assert "skips mesh" in problem(answer, 404, "artifact_not_found")["hint"]
 

@@ -91,7 +91,7 @@ def test_more_steps_train_again_and_leave_the_poses(service: Service, job: str) 
     assert again(found) == {
         name
         for name, state in states(found).items()
-        if state != "skipped" and name not in ("ingest", "poses", "depth", "draft")
+        if state != "skipped" and name not in ("ingest", "poses", "check", "depth", "draft")
     }
 
 

@@ -250,7 +250,13 @@ def test_missing_inputs_leave_out_skipped_stages(tmp_path: Path) -> None:
     before = ["ingest", "frames", "poses", "depth"]
     assert missing_inputs("train", "preview", "video", workspace) == before
     assert missing_inputs("train", "preview", "polycam", workspace) == ["ingest", "depth"]
-    assert missing_inputs("report", "draft", "video", workspace) == [*before, "draft"]
+    assert missing_inputs("report", "draft", "video", workspace) == [
+        *before[:3],
+        "check",
+        "depth",
+        "draft",
+    ]
+    assert missing_inputs("report", "check", "polycam", workspace) == ["ingest", "check"]
 
 
 @pytest.fixture

@@ -43,8 +43,10 @@ def test_a_job_skips_for_its_preset_and_for_its_capture() -> None:
     assert stages_skipped("preview", "polycam") == skipped_stages("polycam") | ON_REQUEST
     assert "views" in stages_skipped("draft", "video", {"views": {}})
     kept = set(STAGE_NAMES) - stages_skipped("draft", "video")
-    assert kept == {"ingest", "frames", "poses", "depth", "draft", "report"}
-    assert kept - stages_skipped("draft", "polycam") == {"ingest", "depth", "draft", "report"}
+    assert kept == {"ingest", "frames", "poses", "check", "depth", "draft", "report"}
+    assert kept - stages_skipped("draft", "polycam") == kept - {"frames", "poses"}
+    checked = set(STAGE_NAMES) - stages_skipped("check", "video")
+    assert checked == {"ingest", "frames", "poses", "check", "report"}
     with pytest.raises(KeyError):
         stages_skipped("ultra", "video")
 
