@@ -13,6 +13,9 @@ from api.settings import ApiSettings
 from storage.memory_privacy import close_memory
 
 GRACE_S = 5
+KEEP_ALIVE_S = 75
+"""A connection that is closed while a caller's next request is on its way costs that request: who
+polls every few seconds should never meet that."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -32,6 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
         access_log=False,  # `api.errors` writes one, with request ids and without signed URLs
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
+        timeout_keep_alive=KEEP_ALIVE_S,
         h11_max_incomplete_event_size=64 << 10,
     )
     return 0

@@ -22,7 +22,7 @@ from storage.runs import has_ended
 from storage.states import JOB_STATES
 
 MAX_PAGE = 200
-QUEUE_COUNTED = 1000
+QUEUE_COUNTED = 300
 Record = TypeVar("Record", Job, Capture)
 
 

@@ -228,7 +228,7 @@ class JobView(JobSummary):
     """A job."""
 
     queue_position: int | None = Field(
-        description="1 is served next; 1000 means so many or more; null once it runs."
+        description="1 is served next; 300 means so many or more; null once it runs."
     )
     artifacts: list[ArtifactView] = Field(description="What can be downloaded so far.")
 
