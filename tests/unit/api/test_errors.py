@@ -28,6 +28,7 @@ V1_CALLS = [
     ("GET", "/v1/captures"),
     ("GET", "/v1/captures/x"),
     ("DELETE", "/v1/captures/x"),
+    ("POST", "/v1/captures/x/check"),
     ("POST", "/v1/jobs"),
     ("POST", "/v1/jobs:validate"),
     ("GET", "/v1/jobs"),
@@ -185,7 +186,11 @@ def test_errors_of_other_rooms_have_their_status(error: Exception, status: int, 
 
 
 def test_every_storage_error_is_mapped() -> None:
-    inside = {storage_errors.StorageError, storage_errors.LostLeaseError}  # never reach a client
+    inside = {  # never reach a client
+        storage_errors.StorageError,
+        storage_errors.LostLeaseError,
+        storage_errors.BlobMissingError,
+    }
     kinds = [
         kind
         for kind in vars(storage_errors).values()

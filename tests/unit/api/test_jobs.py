@@ -45,6 +45,7 @@ def test_new_job_is_queued_with_all_its_stages(service: Service) -> None:
             "labels",
             "capture_id",
             "export",
+            "check",
             "stages",
         ),
         *("queue_position", "metrics", "assets", "error", "artifacts"),
