@@ -42,6 +42,7 @@ OPTIONS: dict[str, Any] = {
     "pointcloud": {"num_points": 4000},
     "video": {"num_frames": 12, "long_side_px": 64},
     "views": {"num_views": 3, "long_side_px": 64},
+    "meshvideo": {"num_frames": 12, "long_side_px": 64},
 }
 
 
