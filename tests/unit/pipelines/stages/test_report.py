@@ -74,6 +74,7 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
         "cameras.ply",
         "dataset.zip",
         "views.zip",
+        "mesh-video.mp4",
     }
     mesh = next(item for item in report["artifacts"] if item["name"] == "mesh.glb")
     content = (job.stage("mesh") / "mesh.glb").read_bytes()
