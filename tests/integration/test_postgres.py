@@ -191,6 +191,8 @@ def test_a_job_on_postgresql_and_s3_with_two_workers_in_two_homes(
         **s3_endpoint.environment(),
     )
     try:
+        # Both homes' stages may write here, as to a cache: what they did is noted in it.
+        engine.environment["TORCH_HOME"] = str(engine.witness.parent)
         for number in (1, 2):
             engine.environment["NERFWORKS_HOME"] = str(tmp_path / f"home{number}")
             engine.start_worker(f"w{number}")

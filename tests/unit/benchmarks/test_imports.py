@@ -15,6 +15,7 @@ ONLY_FOR_PRESETS = ("settings.py", "pipelines.options.PRESETS")
 # They measure the product around the NeRF, so they need all that it needs.
 OF_THE_WHOLE_PRODUCT = (
     "api_process.py",
+    "browser.py",
     "geometry.py",
     "geometry_pictures.py",
     "geometry_truth.py",

@@ -184,6 +184,7 @@ def test_every_field_of_transforms_json(job: Workspace) -> None:
     assert set(content) == {
         "camera_model",
         "orientation_override",
+        "metric",
         "ply_file_path",
         "depth_unit_scale_factor",
         "train_filenames",

@@ -176,7 +176,7 @@ def test_its_keyframes_are_expanded_where_it_has_no_frames() -> None:
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
-        ({"camera_type": "equirectangular"}, "'perspective'"),
+        ({"camera_type": "omni"}, "'perspective'"),
         ({"render_height": 0}, "greater than or equal to 16"),
         ({"render_width": 100_000}, "less than or equal to 8192"),
         ({"camera_path": [], "keyframes": []}, "at least 2 keyframes"),
