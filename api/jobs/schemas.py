@@ -298,7 +298,9 @@ def assets_of(stages: list[StageRow]) -> dict[str, Any] | None:
 def check_of(job: Job) -> dict[str, Any] | None:
     """How the capture was filmed, from its check, or else from what a failed stage said of it."""
     for row in job.stages:
-        if row.name == "check" and row.state == "succeeded" and row.summary:
-            return {key: row.summary[key] for key in _CHECK}
+        told = row.summary or {}
+        # A worker of another version may have told less.
+        if row.name == "check" and row.state == "succeeded" and set(_CHECK) <= set(told):
+            return {key: told[key] for key in _CHECK}
     found: dict[str, Any] | None = (job.error or {}).get("details", {}).get("check")
     return found
