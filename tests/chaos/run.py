@@ -207,7 +207,10 @@ def _download_some(callers: Callers, folder: Path, seed: int) -> list[str]:
 
 def _unfinished(store: S3ObjectStore) -> list[str]:
     """Multipart uploads that nobody finished or dropped."""
-    with_client = store._client.list_multipart_uploads(Bucket=store._bucket)
+    try:
+        with_client = store._client.list_multipart_uploads(Bucket=store._bucket)
+    except store._client.exceptions.NoSuchUpload:  # rclone's way to say that there is none
+        return []
     return [f"{item['Key']} is half sent" for item in with_client.get("Uploads", [])]
 
 
