@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -72,16 +72,26 @@ async def get_services(request: Request) -> Services:
     return services
 
 
-ServicesDep = Annotated[Services, Depends(get_services)]
+SharedServicesDep = Annotated[Services, Depends(get_services)]
+"""For what no caller asks: keys, health, signed addresses. Its database is that of all tenants."""
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Whose call it is. id: of the API key."""
+
+    id: str
+    tenant_id: str
+
 
 _bearer = HTTPBearer(auto_error=False, description="An API key of this service.")
 
 
 def require_key(
-    services: ServicesDep,
+    services: SharedServicesDep,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
-) -> str:
-    """The id of the caller's key. Raises UnauthorizedError.
+) -> Caller:
+    """Whose key it is. Raises UnauthorizedError.
 
     Keys hold 256 random bits and are looked up by their SHA-256, so that the comparison gives
     nothing away about them.
@@ -95,17 +105,24 @@ def require_key(
         record = find_api_key(session, key)
         if record is None:
             raise UnauthorizedError("The API key is not valid.")
-        key_id, due = record.id, is_use_due(record, now(session))
+        caller, due = Caller(record.id, record.tenant_id), is_use_due(record, now(session))
     if due:
         with services.database.session_scope() as session:
-            touch_api_key(session, key_id)
-    return key_id
+            touch_api_key(session, caller.id)
+    return caller
 
 
-CallerDep = Annotated[str, Depends(require_key)]
-"""The id of the caller's key."""
+CallerDep = Annotated[Caller, Depends(require_key)]
 
 
-def actor_of(caller: str) -> str:
+async def get_own_services(services: SharedServicesDep, caller: CallerDep) -> Services:
+    """The parts for one caller: the database shows, and lets go of, nothing but its tenant's."""
+    return replace(services, database=services.database.of_tenant(caller.tenant_id))
+
+
+ServicesDep = Annotated[Services, Depends(get_own_services)]
+
+
+def actor_of(caller: Caller) -> str:
     """A caller as events name it."""
-    return f"api-key:{caller}"
+    return f"api-key:{caller.id}"

@@ -7,7 +7,7 @@ import asyncio
 from fastapi import APIRouter, Response
 from pydantic import BaseModel
 
-from api.deps import ServicesDep
+from api.deps import SharedServicesDep
 from api.errors import responses
 from api.problems import UnavailableError
 
@@ -35,7 +35,7 @@ async def get_liveness(response: Response) -> Liveness:
 
 
 @router.get("/readyz", responses=responses("not_ready"))
-async def get_readiness(services: ServicesDep, response: Response) -> Readiness:
+async def get_readiness(services: SharedServicesDep, response: Response) -> Readiness:
     """Whether database, broker and object store answer, each within its time."""
     response.headers["Cache-Control"] = "no-store"
     timeout_s = services.settings.check_timeout_s

@@ -19,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 from starlette.responses import Response
 
-from api.deps import Services, actor_of
+from api.deps import Caller, Services, actor_of
 from storage.idempotency import KeptAnswer, claim, keep, release, scope_of
 
 IdempotencyKey = Annotated[
@@ -36,15 +36,15 @@ IdempotencyKey = Annotated[
 
 @dataclass(frozen=True)
 class Once:
-    """One call. caller: the id of its API key. key: None where the caller gave none."""
+    """One call. key: None where the caller gave none."""
 
-    caller: str
+    caller: Caller
     call: str
     key: str | None
     fingerprint: str
 
     @classmethod
-    def of(cls, caller: str, call: str, key: str | None, *content: str) -> Once:
+    def of(cls, caller: Caller, call: str, key: str | None, *content: str) -> Once:
         """A call with what it asks for: the same content, the same request."""
         digest = hashlib.sha256("\0".join(content).encode("utf-8", "replace")).hexdigest()
         return cls(caller, call, key, digest)
@@ -86,7 +86,7 @@ def do_once(
         with services.database.session_scope(actor_of(once.caller), step="create") as session:
             answer = answer_in(session)
         return _response(answer, is_replayed=False)
-    scope = scope_of(once.caller, once.call, once.key)
+    scope = scope_of(once.caller.id, once.call, once.key)
     held = claim(services.database, scope, once.fingerprint)
     if isinstance(held, KeptAnswer):
         return _response(held, is_replayed=True)

@@ -10,8 +10,9 @@ from sqlalchemy.orm import Session
 
 from storage.db import now
 from storage.errors import NotFoundError
-from storage.models import DEFAULT_TENANT, ApiKey
+from storage.models import ApiKey
 from storage.new_keys import new_api_key
+from storage.tenants import DEFAULT_TENANT
 
 _USED_GRAIN = timedelta(minutes=1)  # last_used_at moves no oftener: a read should rarely write
 
@@ -44,14 +45,6 @@ def find_api_key(session: Session, key: str) -> ApiKey | None:
     """The record of a key that is valid, or None for one that is unknown or revoked."""
     query = select(ApiKey).where(ApiKey.sha256 == _digest(key), ApiKey.revoked_at.is_(None))
     return session.scalar(query)
-
-
-def tenant_of(session: Session, key_id: str) -> str:
-    """Whose a key is. Raises NotFoundError."""
-    record = session.get(ApiKey, key_id)
-    if record is None:
-        raise NotFoundError("API key", key_id)
-    return record.tenant_id
 
 
 def is_use_due(record: ApiKey, when: datetime) -> bool:

@@ -12,6 +12,7 @@ are UTC.
 
 from __future__ import annotations
 
+import copy
 import math
 import sqlite3
 import time
@@ -41,6 +42,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from storage.postgres import bound
 from storage.steps import reached
+from storage.tenants import keep_to, watch
 from storage.turns import Turns
 
 BUSY_TIMEOUT_S = 30.0
@@ -228,6 +230,15 @@ class Database:
         self._read = sessionmaker(
             self.engine.execution_options(nerfworks_read_only=True), expire_on_commit=False
         )
+        watch(self._write)
+        watch(self._read)
+        self._tenant_id: str | None = None
+
+    def of_tenant(self, tenant_id: str) -> Database:
+        """The same database for one tenant, whose sessions see its rows alone."""
+        narrowed = copy.copy(self)
+        narrowed._tenant_id = tenant_id
+        return narrowed
 
     @contextmanager
     def session_scope(
@@ -239,6 +250,7 @@ class Database:
         this transaction is.
         """
         with self._turn(), self._write.begin() as session:
+            self._narrow(session)
             if actor is not None:
                 name_actor(session, actor)
             yield session
@@ -265,7 +277,12 @@ class Database:
         What it loaded can be used after the block.
         """
         with self._read() as session:
+            self._narrow(session)
             yield session
+
+    def _narrow(self, session: Session) -> None:
+        if self._tenant_id is not None:
+            keep_to(session, self._tenant_id)
 
     def ping(self) -> None:
         """Raise sqlalchemy's error where the database does not answer."""

@@ -25,10 +25,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
 from storage.db import CleanJson, CleanText, UtcDateTime
-
-TENANT_LENGTH = 28
-DEFAULT_TENANT = "default"
-"""Whose everything is, for now: rows and object keys say it, so that there can be more than one."""
+from storage.tenants import Tenanted
 
 _BIG = BigInteger().with_variant(Integer(), "sqlite")  # only INTEGER counts up by itself there
 ID_LENGTH = 28
@@ -58,7 +55,7 @@ class Base(DeclarativeBase):
     )
 
 
-class Blob(Base):
+class Blob(Tenanted, Base):
     """Bytes in the object store, and how many captures are made of them (`storage.blobs`).
 
     sha256: of the bytes; a tenant's second upload of the same is one reference more. None where
@@ -68,7 +65,6 @@ class Blob(Base):
     __tablename__ = "blobs"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     sha256: Mapped[str | None] = mapped_column(String(64))
     object_key: Mapped[str] = mapped_column(String(255))
     refs: Mapped[int] = mapped_column(Integer)
@@ -80,7 +76,7 @@ class Blob(Base):
     )
 
 
-class Capture(Base):
+class Capture(Tenanted, Base):
     """An upload. A deleted one stays as a tombstone for the jobs that speak of it.
 
     blob_id: its bytes; None once it is deleted. object_key: where they lie, or lay.
@@ -89,7 +85,6 @@ class Capture(Base):
     __tablename__ = "captures"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     blob_id: Mapped[str | None] = mapped_column(ForeignKey("blobs.id"), index=True)
     filename: Mapped[str] = mapped_column(CleanText(255))
     kind: Mapped[str] = mapped_column(String(32))
@@ -103,7 +98,7 @@ class Capture(Base):
     __table_args__ = (Index(None, "created_at", "id"),)
 
 
-class Job(Base):
+class Job(Tenanted, Base):
     """The stages on one capture, or an export of another job's results (`storage.exports`).
 
     parent_id: the job that an export is of. generation: 1, and one more with every retry. options:
@@ -113,7 +108,6 @@ class Job(Base):
     __tablename__ = "jobs"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     object_root: Mapped[str] = mapped_column(String(255))
     capture_id: Mapped[str] = mapped_column(ForeignKey("captures.id"), index=True)
     parent_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
@@ -141,7 +135,7 @@ class Job(Base):
     )
 
 
-class JobGeneration(Base):
+class JobGeneration(Tenanted, Base):
     """What a job was asked for, the first time and with every retry: what a retry overwrites.
 
     options: of all stages, as this generation ran them. from_stage: the one that its retry named.
@@ -151,13 +145,12 @@ class JobGeneration(Base):
 
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
     generation: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     options: Mapped[dict[str, Any]] = mapped_column(CleanJson)
     from_stage: Mapped[str | None] = mapped_column(String(32))
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
 
-class StageRow(Base):
+class StageRow(Tenanted, Base):
     """One stage of one job, and its lease.
 
     queue_key: sorts the stages that wait in the order of service. resource: what it runs on, "cpu"
@@ -170,7 +163,6 @@ class StageRow(Base):
     __tablename__ = "stages"
 
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     name: Mapped[str] = mapped_column(String(32))
     seq: Mapped[int] = mapped_column(Integer)
@@ -209,7 +201,7 @@ class StageRow(Base):
     )
 
 
-class StageRun(Base):
+class StageRun(Tenanted, Base):
     """One claim of a stage, from its start to its end: what a later claim does not overwrite.
 
     owner: the worker's id and its boot nonce. outcome: how it ended (`storage.runs.OUTCOMES`), None
@@ -221,7 +213,6 @@ class StageRun(Base):
     __tablename__ = "stage_runs"
 
     id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     stage: Mapped[str] = mapped_column(String(32))
     token: Mapped[int] = mapped_column(Integer)
@@ -242,7 +233,7 @@ class StageRun(Base):
     __table_args__ = (Index(None, "job_id", "stage", "token", unique=True),)
 
 
-class Event(Base):
+class Event(Tenanted, Base):
     """What happened, in order: the feed of state changes, written in their transactions.
 
     actor: who changed it ("worker:ID", "api-key:ID", "service"). reason: why, in a word or an
@@ -252,7 +243,6 @@ class Event(Base):
     __tablename__ = "events"
 
     seq: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     stage: Mapped[str | None] = mapped_column(String(32))
     kind: Mapped[str] = mapped_column(String(48))
@@ -264,13 +254,12 @@ class Event(Base):
     __table_args__ = (Index(None, "job_id", "seq"),)
 
 
-class LogLine(Base):
+class LogLine(Tenanted, Base):
     """One line that a stage wrote."""
 
     __tablename__ = "log_lines"
 
     id: Mapped[int] = mapped_column(_BIG, primary_key=True, autoincrement=True)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
     stage: Mapped[str] = mapped_column(String(32))
     attempt: Mapped[int] = mapped_column(Integer)
@@ -299,13 +288,12 @@ class Worker(Base):
     seen_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
 
-class ApiKey(Base):
+class ApiKey(Tenanted, Base):
     """A key of the API: only its SHA-256 is kept. What is made with it is its tenant's."""
 
     __tablename__ = "api_keys"
 
     id: Mapped[str] = mapped_column(String(ID_LENGTH), primary_key=True, default=new_id)
-    tenant_id: Mapped[str] = mapped_column(String(TENANT_LENGTH))
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
     name: Mapped[str] = mapped_column(CleanText(100))
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)

@@ -20,6 +20,7 @@ from storage.models import Capture, Event, Job, StageRow, is_id
 from storage.queue import RESOURCES
 from storage.runs import has_ended
 from storage.states import JOB_STATES
+from storage.tenants import OF_ALL
 
 MAX_PAGE = 200
 QUEUE_COUNTED = 300
@@ -150,13 +151,15 @@ def get_job(session: Session, job_id: str, *, manifests: bool = False) -> Job:
 def queue_position(session: Session, job: Job) -> int | None:
     """1 for the job that is served next, and so on; None for a job that is not queued.
 
-    Counted up to QUEUE_COUNTED, which means so many or more: an answer costs the same in any queue.
+    All tenants wait in one queue. Counted up to QUEUE_COUNTED, which means so many or more: an
+    answer costs the same in any queue.
     """
     if job.state != "queued":
         return None
     before = tuple_(Job.created_at, Job.id) < tuple_(job.created_at, job.id)
     earlier = select(Job.id).where(Job.state == "queued", before).limit(QUEUE_COUNTED - 1)
-    return session.scalars(select(func.count()).select_from(earlier.subquery())).one() + 1
+    counted = select(func.count()).select_from(earlier.subquery())
+    return session.scalars(counted, execution_options=OF_ALL).one() + 1
 
 
 def list_events(session: Session, job_id: str, after_seq: int = 0, limit: int = 500) -> list[Event]:

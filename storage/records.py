@@ -14,8 +14,9 @@ from storage.blobs import drop_blob, take_blob
 from storage.claims import Claim
 from storage.db import clean_text, now
 from storage.errors import ConflictError, NotFoundError
-from storage.models import DEFAULT_TENANT, Capture, Job, LogLine, StageRow, Worker
+from storage.models import Capture, Job, LogLine, StageRow, Worker
 from storage.states import JOB_LIVE
+from storage.tenants import DEFAULT_TENANT
 
 WORKER_LIVE_S = 60.0
 MAX_LOG_LINES = 20_000

@@ -12,9 +12,10 @@ from sqlalchemy.orm import Session
 from storage.db import Database
 from storage.jobs import StageSeed, create_job
 from storage.keys import blob_content, job_root
-from storage.models import DEFAULT_TENANT, Base, Capture, Job, StageRow, new_id
+from storage.models import Base, Capture, Job, StageRow, new_id
 from storage.records import create_capture
 from storage.schema import upgrade
+from storage.tenants import DEFAULT_TENANT
 
 LINE = (StageSeed("first", ()), StageSeed("second", ("first",)), StageSeed("third", ("second",)))
 DIAMOND = (

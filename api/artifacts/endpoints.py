@@ -11,7 +11,7 @@ from api.artifacts import service
 from api.artifacts.content import content_response
 from api.artifacts.schemas import ArtifactList
 from api.codes import BYTES
-from api.deps import ServicesDep
+from api.deps import ServicesDep, SharedServicesDep
 from api.errors import responses
 from api.ids import JobId
 from storage import queries
@@ -75,7 +75,7 @@ def download_artifact(
 @signed_router.get(
     "/{token}", response_class=Response, responses={**responses("url_invalid", *BYTES), **_CONTENT}
 )
-def download_object(token: str, services: ServicesDep, request: Request) -> Response:
+def download_object(token: str, services: SharedServicesDep, request: Request) -> Response:
     """A signed, expiring URL of the local object store: needs no key."""
     signed = verify_object_token(services.settings.signing_key(), token)
     with services.asking_the_store():

@@ -15,7 +15,6 @@ from api.deps import DELETE_WAIT_S, Services
 from api.idempotency import Done, Once, do_once
 from pipelines.captures.sniff import Sniffed, sniff
 from storage import records
-from storage.api_keys import tenant_of
 from storage.blobs import find_blob
 from storage.errors import BlobMissingError, ObjectStoreError
 from storage.keys import blob_content
@@ -30,8 +29,8 @@ def keep(services: Services, received: Received, once: Once) -> Response:
     file that is of no use.
     """
     sniffed = sniff(received.path, received.filename)
+    tenant_id = once.caller.tenant_id
     with services.database.read_scope() as session:
-        tenant_id = tenant_of(session, once.caller)
         found = find_blob(session, tenant_id, received.sha256)
     upload = _Upload(services, received, sniffed, tenant_id, once)
     if found is not None:

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from starlette.responses import Response
 
 from api.artifacts import service as artifacts
-from api.deps import DELETE_WAIT_S, Services, actor_of
+from api.deps import DELETE_WAIT_S, Caller, Services, actor_of
 from api.idempotency import Once, do_once
 from api.jobs import retrying
 from api.jobs.schemas import JobPlan, JobRequest, JobView, JobWish, RetryRequest
@@ -128,7 +128,7 @@ def retry(
     return done.response
 
 
-def cancel(services: Services, job_id: str, caller: str) -> None:
+def cancel(services: Services, job_id: str, caller: Caller) -> None:
     """Ask a job to stop. Raises ConflictedError where it ended otherwise already."""
     with services.database.session_scope(actor_of(caller), step="cancel") as session:
         job = jobs.request_cancel(session, job_id)

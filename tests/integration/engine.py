@@ -17,7 +17,7 @@ from storage.bell import Bell
 from storage.db import Database
 from storage.jobs import StageSeed, create_job, ready_stage_ids, request_cancel
 from storage.keys import blob_content
-from storage.models import DEFAULT_TENANT, Job, StageRow, new_id
+from storage.models import Job, StageRow, new_id
 from storage.objects import ObjectStore
 from storage.open_objects import open_object_store
 from storage.queries import get_job
@@ -25,6 +25,7 @@ from storage.records import create_capture, read_logs
 from storage.runs import list_runs
 from storage.schema import upgrade
 from storage.settings import StorageSettings
+from storage.tenants import DEFAULT_TENANT
 from tests.integration.toy_stages import STAGES
 
 ROOT = Path(__file__).resolve().parents[2]

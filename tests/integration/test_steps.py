@@ -28,9 +28,10 @@ from storage.db import now
 from storage.jobs import stage_id
 from storage.keys import attempt_prefix, job_root
 from storage.leases import reap_expired
-from storage.models import DEFAULT_TENANT, Job, new_id
+from storage.models import Job, new_id
 from storage.objects_local import LocalObjectStore
 from storage.steps import names
+from storage.tenants import DEFAULT_TENANT
 from tests.faults import at_step, lose_answer
 from tests.histories import check_history
 from tests.integration.aftermath import check_only_what_is_named, check_published

@@ -24,8 +24,9 @@ from api.captures.receiving import sweep
 from storage.deletions import drain_deletions
 from storage.idempotency import claim
 from storage.keys import attempt_prefix, job_root
-from storage.models import DEFAULT_TENANT, Capture, Job
+from storage.models import Capture, Job
 from storage.objects_local import LocalObjectStore
+from storage.tenants import DEFAULT_TENANT
 from tests.faults import at_step
 from tests.histories import check_can_go_on, check_history
 from tests.integration.aftermath import check_only_what_is_named

@@ -14,6 +14,7 @@ import pytest
 
 from api.client.client import Client
 from api.client.models import ApiProblem
+from api.deps import Caller
 from api.idempotency import Once
 from api.jobs.schemas import JobRequest
 from storage.api_keys import create_api_key
@@ -71,11 +72,12 @@ def test_a_refused_call_leaves_its_key_free(service: Service) -> None:
 
 def test_while_the_first_is_at_work_the_second_is_told_to_wait(service: Service) -> None:
     with service.services.database.read_scope() as session:
-        caller = session.query(ApiKey).one().id
+        key = session.query(ApiKey).one()
+        caller = Caller(key.id, key.tenant_id)
     body = {"capture_id": service.upload()["id"]}
     call = "POST /v1/jobs"
     once = Once.of(caller, call, ONCE["Idempotency-Key"], JobRequest(**body).model_dump_json())
-    scope = scope_of(caller, call, ONCE["Idempotency-Key"])
+    scope = scope_of(caller.id, call, ONCE["Idempotency-Key"])
     token = claim(service.services.database, scope, once.fingerprint)
     assert isinstance(token, str)
     answer = service.http.post("/v1/jobs", json=body, headers=ONCE)

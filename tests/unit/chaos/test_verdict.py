@@ -22,7 +22,6 @@ from storage.jobs import create_job, stage_id
 from storage.keys import attempt_prefix, blob_content
 from storage.leases import succeed_stage
 from storage.models import (
-    DEFAULT_TENANT,
     Blob,
     Capture,
     Event,
@@ -36,6 +35,7 @@ from storage.models import (
 from storage.objects_local import LocalObjectStore
 from storage.records import create_capture
 from storage.schema import upgrade
+from storage.tenants import DEFAULT_TENANT
 from tests.chaos import verdict
 from tests.chaos.load import Accepted
 from tests.chaos.plans import KIND, Plan, chains, make_plans
