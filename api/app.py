@@ -16,7 +16,7 @@ from fastapi.responses import HTMLResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
-from api import catalogue, errors, health
+from api import catalogue, errors, health, workers
 from api.artifacts import endpoints as artifacts
 from api.captures import endpoints as captures
 from api.captures.receiving import sweep
@@ -133,7 +133,10 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
             page_of(app.openapi()), headers={"Content-Security-Policy": PAGE_POLICY}
         )
 
-    keyed = (*(captures.router, jobs.router, exports.router, artifacts.router, catalogue.router),)
+    keyed = (
+        *(captures.router, jobs.router, exports.router, artifacts.router, catalogue.router),
+        workers.router,
+    )
     others = (artifacts.signed_router, health.router, catalogue.page_router)
     errors.install(
         app,

@@ -95,7 +95,7 @@ class Capture(Tenanted, Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
-    __table_args__ = (Index(None, "created_at", "id"),)
+    __table_args__ = (Index(None, "tenant_id", "created_at", "id"),)
 
 
 class Job(Tenanted, Base):
@@ -129,7 +129,7 @@ class Job(Tenanted, Base):
     stages: Mapped[list[StageRow]] = relationship(order_by="StageRow.seq", lazy="select")
 
     __table_args__ = (
-        Index(None, "created_at", "id"),
+        Index(None, "tenant_id", "created_at", "id"),
         Index(None, "state", "created_at", "id"),
         Index(None, "parent_id", "created_at", "id"),
     )
@@ -272,7 +272,8 @@ class LogLine(Tenanted, Base):
 class Worker(Base):
     """A worker process and what it has. It is live while `seen_at` is fresh. It serves all tenants.
 
-    boot: chance, made when the process starts; tells two that were given one id apart.
+    boot: chance, made when the process starts; tells two that were given one id apart. contained:
+    what holds its stages in, {"on": [...], "lacks": [...]}; None before its first stage process.
     """
 
     __tablename__ = "workers"
@@ -284,6 +285,7 @@ class Worker(Base):
     queues: Mapped[list[str]] = mapped_column(CleanJson)
     slots: Mapped[int] = mapped_column(Integer, default=1)
     has_gpu: Mapped[bool] = mapped_column(Boolean, default=False)
+    contained: Mapped[dict[str, list[str]] | None] = mapped_column(CleanJson(none_as_null=True))
     started_at: Mapped[datetime] = mapped_column(UtcDateTime)
     seen_at: Mapped[datetime] = mapped_column(UtcDateTime)
 

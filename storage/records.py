@@ -19,6 +19,7 @@ from storage.states import JOB_LIVE
 from storage.tenants import DEFAULT_TENANT
 
 WORKER_LIVE_S = 60.0
+WORKER_KEPT = timedelta(days=1)
 MAX_LOG_LINES = 20_000
 MAX_LINE_CHARS = 2_000
 
@@ -110,6 +111,7 @@ def register_worker(
     queues: Sequence[str],
     slots: int,
     has_gpu: bool,
+    contained: dict[str, list[str]] | None = None,
     take_over: bool = False,
     when: datetime | None = None,
 ) -> bool:
@@ -130,7 +132,7 @@ def register_worker(
         row = Worker(id=worker_id, started_at=when, boot=boot)
         session.add(row)
     row.hostname, row.pid, row.queues = hostname, pid, list(queues)
-    row.slots, row.has_gpu, row.seen_at = slots, has_gpu, when
+    row.slots, row.has_gpu, row.contained, row.seen_at = slots, has_gpu, contained, when
     return True
 
 
@@ -146,6 +148,12 @@ def worker_seen_lately(
 def forget_worker(session: Session, worker_id: str, boot: str) -> None:
     """A worker ends in order."""
     session.execute(delete(Worker).where(Worker.id == worker_id, Worker.boot == boot))
+
+
+def forget_lost_workers(session: Session, when: datetime | None = None) -> None:
+    """Drop the rows of workers that ended without a word, so long ago that nobody asks for them."""
+    edge = (when or now(session)) - WORKER_KEPT
+    session.execute(delete(Worker).where(Worker.seen_at < edge))
 
 
 def live_workers(session: Session, when: datetime | None = None) -> list[Worker]:

@@ -6,7 +6,8 @@ when several workers do it, because the database decides.
     dispatch    ring again for ready stages that nobody came for
     offer       let a free slot take a ready stage directly: work goes on without the broker, and
                 also where the consumer is stuck after the broker came back
-    clean       drop local folders of jobs that are over, and bytes of deleted records
+    clean       drop local folders of jobs that are over, rows of calls and workers of long ago, and
+                bytes of deleted records
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from storage.leases import reap_expired
 from storage.objects import ObjectStore
 from storage.queries import WaitingStage, finished_jobs, ready_unclaimed
 from storage.reconciling import sweep_orphans
+from storage.records import forget_lost_workers
 from worker.settings import WorkerSettings
 
 _log = logging.getLogger("nerfworks.worker")
@@ -202,8 +204,9 @@ class Housekeeping:
                 shutil.rmtree(aside, ignore_errors=True)
 
     def clean(self) -> None:
-        """Drop what finished jobs left on this machine, and bytes of deleted records."""
+        """Drop what finished jobs left here, rows that nobody needs, bytes of deleted records."""
         self._clean_folders()
         with self._database.session_scope() as session:
             forget_old(session)
+            forget_lost_workers(session)
         drain_deletions(self._database, self._store)  # last: the store may hang

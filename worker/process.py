@@ -44,7 +44,8 @@ class StageProcess:
 
     registry: dotted name of the stages' registry. plan: what it may touch. preload: names of
     stages whose code it loads while it is idle.
-    messages: what the child sent, ending with {"type": "exit"} when it is gone.
+    messages: what the child sent, ending with {"type": "exit"} when it is gone. contained: what
+    holds it in, once it has said so.
     """
 
     def __init__(self, registry: str, plan: Plan, preload: Sequence[str] = ()) -> None:
@@ -53,6 +54,7 @@ class StageProcess:
         self._log_ended = threading.Event()
         self._run_id = ""
         self._guardian: int | None = None
+        self.contained: Containment | None = None
         self._wanted_memory = False  # its last lines said that there was none
         self._oom_before = oom_kills()
         message_read, message_write = os.pipe()
@@ -185,7 +187,7 @@ class StageProcess:
     def _greet(self, message: dict[str, Any]) -> None:
         """Take note of what the child says of itself; the log hears it once."""
         self._guardian = message["guardian"]
-        contained = Containment(**message["contained"])
+        contained = self.contained = Containment(**message["contained"])
         if (text := contained.as_text()) not in _said:
             _said.append(text)
             _log.log(

@@ -40,6 +40,7 @@ from storage.queries import StageWork, stage_work
 from storage.runs import RunEnd
 from storage.steps import reached
 from worker.checkpoints import CheckpointUploader, snapshot_of
+from worker.containment.apply import Containment
 from worker.containment.plan import Plan
 from worker.cores import num_cores
 from worker.disk import free_bytes
@@ -252,6 +253,12 @@ class Runner:
     def _is_near_the_capture(self, stage: Stage) -> bool:
         """Whether the stage gets the uploaded bytes: it reads nothing, or only such stages."""
         return all(not self._registry.get_stage(name).reads for name in stage.reads)
+
+    @property
+    def contained(self) -> Containment | None:
+        """What holds this slot's stages in, as its process says; None while there is none."""
+        process = self._process
+        return None if process is None else process.contained
 
     def _ensure_process(self) -> StageProcess:
         if self._process is None or not self._process.is_alive():

@@ -242,6 +242,8 @@ class WorkerRuntime:
                 self._enter(session)
 
     def _enter(self, session: Session, take_over: bool = False) -> bool:
+        told = (runner.contained for runner in self._runners)
+        contained = next((one for one in told if one is not None), None)
         return register_worker(
             session,
             self.identity.id,
@@ -251,6 +253,7 @@ class WorkerRuntime:
             queues=self.identity.queues,
             slots=self.identity.slots,
             has_gpu=self.identity.has_gpu,
+            contained=None if contained is None else contained.as_json(),
             take_over=take_over,
         )
 

@@ -87,19 +87,21 @@ class Received:
 def staging_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
     """A locked file that is gone when the block ends, unless it was moved away."""
     folder.mkdir(parents=True, exist_ok=True)
-    name = secrets.token_hex(16)
-    unlocked, path = folder / f"{name}.new", folder / f"{name}{SUFFIX}"
-    try:
-        with unlocked.open("xb", buffering=0) as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            unlocked.rename(path)  # `sweep` looks at this name only, so never at an unlocked file
-            yield path, file
-    finally:
-        path.unlink(missing_ok=True)
+    while True:
+        path = folder / f"{secrets.token_hex(16)}{SUFFIX}"
+        try:
+            with path.open("xb", buffering=0) as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                if not path.exists():
+                    continue  # a `sweep` came before the lock: once more
+                yield path, file
+                return
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def sweep(folder: Path) -> int:
-    """Remove the staging files that no upload holds. Returns how many."""
+    """Remove the staging files that no upload holds, whoever made them, and when. How many."""
     removed = 0
     for path in folder.glob(f"*{SUFFIX}"):
         try:

@@ -25,6 +25,10 @@ class Containment:
     on: tuple[str, ...]
     lacks: tuple[str, ...]
 
+    def as_json(self) -> dict[str, list[str]]:
+        """For a record."""
+        return {"on": [*self.on], "lacks": [*self.lacks]}
+
     def as_text(self) -> str:
         """One line for a log."""
         text = "; ".join(self.on) or "nothing"

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import hashlib
 import io
 import json
 import socket
+import subprocess
+import sys
 import time
 import tracemalloc
 import zipfile
@@ -276,6 +279,49 @@ def test_start_removes_what_a_killed_process_left_but_not_a_running_upload(tmp_p
         assert held.exists()
         assert not orphan.exists()
     assert not held.exists()
+
+
+def test_a_sweep_that_comes_before_the_lock_costs_no_upload(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another API starts in the same home at the worst moment."""
+    swept = []
+
+    def lock_late(file: Any, how: int) -> None:
+        monkeypatch.undo()
+        swept.append(sweep(tmp_path))
+        fcntl.flock(file, how)
+
+    monkeypatch.setattr("api.captures.receiving.fcntl.flock", lock_late)
+    with staging_file(tmp_path) as (held, file):
+        file.write(b"comes in")
+        assert held.read_bytes() == b"comes in"
+    assert swept == [1]
+    assert not any(tmp_path.iterdir())
+
+
+KILLED = """
+import fcntl, os, sys
+from pathlib import Path
+from api.captures import receiving
+how = sys.argv[2]
+if how == "before the lock":
+    fcntl.flock = lambda *_: os._exit(9)
+with receiving.staging_file(Path(sys.argv[1])) as (path, file):
+    file.write(b"half")
+    os._exit(9)
+"""
+
+
+@pytest.mark.parametrize("moment", ["before the lock", "while it comes in"])
+def test_what_an_api_leaves_that_is_killed_the_next_start_removes(
+    tmp_path: Path, moment: str
+) -> None:
+    command = [sys.executable, "-c", KILLED, str(tmp_path), moment]
+    assert subprocess.run(command, check=False).returncode == 9
+    assert len([*tmp_path.iterdir()]) == 1
+    assert sweep(tmp_path) == 1
+    assert not any(tmp_path.iterdir())
 
 
 async def _received(

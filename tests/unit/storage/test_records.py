@@ -13,7 +13,7 @@ from storage.db import Database
 from storage.deletions import drain_deletions
 from storage.errors import ConflictError, InvalidCursorError, NotFoundError
 from storage.jobs import request_cancel, stage_id
-from storage.models import ApiKey, Capture
+from storage.models import ApiKey, Capture, Worker
 from storage.objects_local import LocalObjectStore
 from storage.queries import get_job, list_captures, list_jobs, queue_position
 from storage.queue import QUEUE_CPU, QUEUE_GPU, queue_for
@@ -21,6 +21,7 @@ from storage.records import (
     MAX_LOG_LINES,
     append_logs,
     delete_capture,
+    forget_lost_workers,
     forget_worker,
     get_capture,
     has_live_gpu,
@@ -139,6 +140,16 @@ def test_a_gpu_counts_while_its_worker_is_live_and_serves_gpu_stages(database: D
         assert has_live_gpu(session, T0)
         forget_worker(session, "b", "b0")
         assert not has_live_gpu(session, T0)
+
+
+def test_workers_that_ended_without_a_word_are_forgotten_after_a_day(database: Database) -> None:
+    common = {"hostname": "h", "pid": 1, "boot": "b0", "slots": 1, "queues": [], "has_gpu": False}
+    with database.session_scope() as session:
+        for name, age_h in (("killed", 25), ("asleep", 23), ("live", 0)):
+            when = T0 - timedelta(hours=age_h)
+            register_worker(session, name, when=when, **common)  # type: ignore[arg-type]
+        forget_lost_workers(session, T0)
+        assert {row.id for row in session.query(Worker)} == {"asleep", "live"}
 
 
 def test_gpu_stages_go_to_cpu_workers_where_no_gpu_is() -> None:

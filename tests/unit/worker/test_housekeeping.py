@@ -15,10 +15,11 @@ from storage.bell import Bell
 from storage.claims import claim_stage
 from storage.jobs import request_cancel, stage_id
 from storage.leases import cancel_stage, heartbeat
-from storage.models import PendingDeletion, StageRow
+from storage.models import PendingDeletion, StageRow, Worker
 from storage.objects_local import LocalObjectStore
 from storage.open_objects import open_object_store
 from storage.queries import WaitingStage
+from storage.records import register_worker
 from storage.settings import StorageSettings
 from tests.factories import make_database, make_job
 from tests.services import Gate
@@ -53,6 +54,33 @@ def test_the_bell_rings_again_after_pauses_that_double(
 ) -> None:
     moment = T0 + timedelta(seconds=asked_after_s)
     assert is_ring_due(waiting(rung_after_s), moment, 60.0) is due
+
+
+def test_cleaning_forgets_workers_that_are_long_gone(tmp_path: Path) -> None:
+    database = make_database(tmp_path)
+    with database.session_scope() as session:
+        register_worker(
+            session,
+            "killed",
+            hostname="h",
+            pid=1,
+            boot="b",
+            queues=["cpu"],
+            slots=1,
+            has_gpu=False,
+            when=T0,
+        )
+    Housekeeping(
+        database,
+        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
+        Bell(NO_BROKER, database),
+        WorkerSettings(),
+        work_dir=tmp_path / "work",
+        register=lambda: None,
+        offer=lambda: None,
+    ).clean()
+    with database.read_scope() as session:
+        assert session.query(Worker).count() == 0
 
 
 def test_folders_go_when_their_job_is_over_and_nothing_of_it_runs(tmp_path: Path) -> None:

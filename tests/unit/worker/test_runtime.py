@@ -112,6 +112,21 @@ def test_stages_of_one_job_that_wait_for_the_same_run_side_by_side_in_two_slots(
     assert overlap(engine.stage(job, "mesh"), engine.stage(job, "video"))
 
 
+def test_what_holds_a_workers_stages_in_is_on_record(engine: Engine) -> None:
+    with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
+        deadline = time.monotonic() + 60.0
+        while True:
+            with engine.database.read_scope() as session:
+                (row,) = live_workers(session)
+            if row.contained is not None:
+                break
+            assert time.monotonic() < deadline, "the stage process said hello to nobody"
+            time.sleep(0.05)
+    assert "environment" in row.contained["on"]
+    assert any(one.startswith("limits of") for one in row.contained["on"])
+    assert set(row.contained) == {"on", "lacks"}
+
+
 def test_a_stage_alone_has_all_cores(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.runtime.num_cores", lambda: 8)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
