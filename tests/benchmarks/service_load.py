@@ -3,10 +3,10 @@
     python -m tests.benchmarks.service_load [--few 100] [--many 10000] [--calls 60] [--seconds 20]
 
 On SQLite and, where the wheel is installed, on PostgreSQL. Prints the median of choosing and
-claiming the next stage, of a look at what waits, and of reading one job with its place in the
-queue, as `GET /v1/jobs/{id}` does, with few and with many jobs queued; that of claiming a CPU stage
-while a thousand stages wait that only a GPU worker may take, and while none do; and what two
-hundred callers who poll a job get, of an API with the many jobs queued.
+claiming the next stage, of a look at what waits, of reading one job with its place in the queue, as
+`GET /v1/jobs/{id}` does, and of a page of jobs, with few and with many jobs queued; that of
+claiming a CPU stage while a thousand stages wait that only a GPU worker may take, and while none
+do; and what two hundred callers who poll a job get, of an API with the many jobs queued.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from storage.jobs import StageSeed, queue_key, stage_id
 from storage.keys import job_root
 from storage.leases import release_stage
 from storage.models import Event, Job, JobGeneration, StageRow, new_id
-from storage.queries import get_job, queue_position, ready_unclaimed
+from storage.queries import get_job, list_jobs, queue_position, ready_unclaimed
 from storage.queue import RESOURCES
+from storage.tenants import DEFAULT_TENANT
 from tests.benchmarks.api_process import HEADERS, empty_databases, kinds, serving
 from tests.factories import make_job
 
@@ -116,9 +117,14 @@ class Calls:
             ready_unclaimed(session, limit=1)
 
     def read(self) -> None:
-        """A job and its place."""
-        with self._database.read_scope() as session:
+        """A job and its place, as its tenant is told."""
+        with self._database.of_tenant(DEFAULT_TENANT).read_scope() as session:
             queue_position(session, get_job(session, self._job_id, manifests=True))
+
+    def page(self) -> None:
+        """The newest jobs of a tenant."""
+        with self._database.of_tenant(DEFAULT_TENANT).read_scope() as session:
+            list_jobs(session, limit=20)
 
     def undo(self) -> None:
         """Give back what was claimed."""
@@ -196,7 +202,7 @@ def report(kind: str, few: int, many: int, times: int, seconds: float) -> None:
         last = enqueue(long, many, SEEDS)[-1]
         one, other = Calls(short, enqueue(short, few, SEEDS)[-1]), Calls(long, last)
         print(f"{kind}: p50 in ms with {few} and {many} queued jobs")
-        compare(("claim", "look", "read"), one, other, times)
+        compare(("claim", "look", "read", "page"), one, other, times)
         enqueue(starving, NUM_GPU_STAGES, GPU_SEEDS)
         cpu = [
             Calls(database, enqueue(database, times + 1, CPU_SEEDS)[-1], ("cpu",))

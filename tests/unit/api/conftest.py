@@ -41,13 +41,13 @@ LEASE_S = 60.0
 
 
 def zip_of_pictures(num: int = 3) -> bytes:
-    """A .zip of tiny PNG pictures."""
+    """A .zip of tiny PNG pictures: the same bytes whenever it is made."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for index in range(num):
             picture = io.BytesIO()
             Image.new("RGB", (16, 12), (index * 20 % 256, 80, 120)).save(picture, "PNG")
-            archive.writestr(f"photo_{index}.png", picture.getvalue())
+            archive.writestr(zipfile.ZipInfo(f"photo_{index}.png"), picture.getvalue())
     return packed.getvalue()
 
 
