@@ -232,13 +232,24 @@ def run_stage(
             )
             _publish(out, workspace.stage(stage.name))
     except BaseException as error:
-        if isinstance(error, PipelineError) and not isinstance(error, Cancelled):
+        if isinstance(error, Exception) and not isinstance(error, Cancelled):
             _keep_report(out, workspace.failed(stage.name))
-            _explain(stage, workspace, error, hooks.logger)
+            known = error if isinstance(error, PipelineError) else internal_error(stage.name, error)
+            _explain(stage, workspace, known, hooks.logger)
         shutil.rmtree(out, ignore_errors=True)
         raise
     shutil.rmtree(checkpoint, ignore_errors=True)
     return manifest
+
+
+def internal_error(stage: str, error: BaseException) -> PipelineError:
+    """What people read of an exception that nobody foresaw. Its own text stays out: it may hold
+    paths."""
+    return PipelineError(
+        f"The stage {stage} failed with {type(error).__name__}.",
+        code="internal_error",
+        hint="This is a fault of the service: see the job's logs for the step that failed.",
+    )
 
 
 def _compile_seconds() -> float:

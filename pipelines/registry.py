@@ -45,7 +45,7 @@ _EXPLAINS = "pipelines.stages.check:write_failed_check"
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=7,
+        version=8,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",
@@ -76,7 +76,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="check",
-        version=1,
+        version=2,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.check:run",

@@ -50,7 +50,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from pipelines.errors import Cancelled, PipelineError, ResourceError
-from pipelines.manifest import RunHooks, run_stage
+from pipelines.manifest import RunHooks, internal_error, run_stage
 from pipelines.workspace import Workspace
 from worker.containment.apply import apply_plan
 from worker.containment.limits import allow_cpu_seconds
@@ -65,7 +65,6 @@ GUARDIAN_STEP_S = 0.5
 PROGRESS_STEP_S = 0.25
 PREDECESSOR_TIMEOUT_S = 20.0
 OOM_SCORE = 500
-INTERNAL_HINT = "This is a fault of the service: see the job's logs for the step that failed."
 
 
 def kill_group() -> NoReturn:
@@ -149,11 +148,7 @@ def error_of(error: BaseException, stage: str) -> dict[str, Any]:
             code="disk_full",
             hint="Free some space on the worker's disk; then submit the job again.",
         ).as_dict()
-    return PipelineError(
-        f"The stage {stage} failed with {type(error).__name__}.",
-        code="internal_error",
-        hint=INTERNAL_HINT,
-    ).as_dict()
+    return internal_error(stage, error).as_dict()
 
 
 class Messages:

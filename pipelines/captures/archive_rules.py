@@ -39,6 +39,7 @@ _ENTRY_SIGNATURE = b"PK\x01\x02"
 _ENCRYPTED_BITS = 0x1 | 0x40 | 0x2000
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _SMALL_BYTES = 4 << 20
+_COPY_BYTES = 1 << 20
 _JUNK_NAMES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 
 
@@ -261,6 +262,20 @@ def head_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     if is_zip(head):
         raise _unsafe(f'The archive holds another archive: "{shown(info.filename)}".')
     return head
+
+
+def copy_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path) -> None:
+    """Write one entry to `target`. Raises CaptureError: archive_damaged, also where it holds more
+    or less than it declares."""
+    with reading(), archive.open(info) as source, target.open("wb") as sink:
+        left = info.file_size
+        while chunk := source.read(min(_COPY_BYTES, left + 1)):
+            left -= len(chunk)
+            if left < 0:
+                raise damaged()
+            sink.write(chunk)
+    if left:
+        raise damaged()
 
 
 def damaged() -> CaptureError:

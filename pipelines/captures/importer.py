@@ -15,8 +15,9 @@ more than that goes into a file of its own: `IMPORTER.read` is only resolved in 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 from pipelines.captures.magic import image_format
@@ -30,10 +31,14 @@ class Listing:
 
     heads: the first bytes (`magic.HEAD_BYTES`) of each file of an archive by its name, with "/";
     of an upload that is no archive, those of the upload itself under the name "".
+    copy: writes one file of an archive to a path; None where there is nothing but heads.
+    num_bytes: of each file, where `copy` is.
     """
 
     heads: Mapping[str, bytes]
     is_archive: bool = True
+    copy: Callable[[str, Path], None] | None = None
+    num_bytes: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
     def pictures(self) -> frozenset[str]:

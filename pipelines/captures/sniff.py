@@ -16,6 +16,7 @@ from typing import Any
 from pipelines.captures.archive_rules import (
     ArchiveLimits,
     checked_entries,
+    copy_entry,
     head_of,
     open_archive,
 )
@@ -103,8 +104,12 @@ def _sniff_zip(path: Path, limits: ArchiveLimits) -> Sniffed:
     with open_archive(path, limits) as archive:
         entries = checked_entries(archive, limits)
         heads = {name: head_of(archive, info) for name, info in entries.items()}
-    listing = Listing(heads)
-    found = claimed(listing)
+        listing = Listing(
+            heads,
+            copy=lambda name, target: copy_entry(archive, entries[name], target),
+            num_bytes={name: info.file_size for name, info in entries.items()},
+        )
+        found = claimed(listing)
     if found is None:
         raise _no_images(heads)
     importer, claim = found

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from scipy import ndimage
 
 Floats = npt.NDArray[np.float32]
 
@@ -32,6 +33,9 @@ _SCALES = 3
 _PLAIN = 2e-4
 """Energy of coarse gradients (of luma in [0, 1]) below which there is nothing to see blurred."""
 _DARK, _BRIGHT = 12, 250
+_BLACK, _WHITE = 1, 254
+"""A ground that was filled in, give or take what packing as JPEG does."""
+_PLAIN_EDGES, _MOST_GROUND = 0.75, 0.98
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,8 @@ class Look:
 
     blur_px: width over which edges are smeared, in pixels of SIDE_PX; None where too little is to
     be seen. streak: by how much more it is smeared in one direction than across, 1 for none.
-    luma: mean, in [0, 1]. dark, bright: shares of pixels that are nearly black, or clipped.
+    luma: mean, in [0, 1], without a black ground. dark, bright: shares of pixels that are nearly
+    black, or clipped, each without a ground of that colour (see `_ground`).
     """
 
     blur_px: float | None
@@ -73,13 +78,31 @@ def look_at(path: Path) -> tuple[Look, Image.Image]:
 def measure(luma: npt.NDArray[np.uint8]) -> Look:
     """luma: [H, W], the long side about SIDE_PX."""
     blur_px, streak = _blur((luma / np.float32(255.0)).astype(np.float32))
+    black, white = _ground(luma <= _BLACK), _ground(luma >= _WHITE)
     return Look(
         blur_px=blur_px,
         streak=streak,
-        luma=float(luma.mean()) / 255.0,
-        dark=float((luma <= _DARK).mean()),
-        bright=float((luma >= _BRIGHT).mean()),
+        luma=float(luma[~black].mean()) / 255.0,
+        dark=float((luma[~black] <= _DARK).mean()),
+        bright=float((luma[~white] >= _BRIGHT).mean()),
     )
+
+
+def _ground(plain: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """What lies around a subject that was cut out or rendered, and says nothing of the light.
+
+    plain: [H, W], where the picture is quite black, or quite white. Returns [H, W], what hangs
+    together with the edges where these are plain most of the way round (a burnt-out sky has the
+    upper edge and parts of two more); nothing else, and nothing where no subject would be left.
+    """
+    nothing = np.zeros_like(plain)
+    edges = np.concatenate([plain[0], plain[-1], plain[1:-1, 0], plain[1:-1, -1]])
+    if edges.mean() < _PLAIN_EDGES:
+        return nothing
+    labels, _ = ndimage.label(plain)
+    at_edges = np.unique(np.concatenate([labels[0], labels[-1], labels[1:-1, 0], labels[1:-1, -1]]))
+    ground: npt.NDArray[np.bool_] = plain & np.isin(labels, at_edges)
+    return nothing if ground.mean() > _MOST_GROUND else ground
 
 
 def _blur(luma: Floats) -> tuple[float | None, float]:

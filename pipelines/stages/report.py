@@ -229,7 +229,9 @@ def write_failed_report(
         } | {"source": "structure from motion", "advice": said["advice"]}
     shown = {key: error[key] for key in ("code", "message", "hint", "details") if key in error}
     if report["check"] is None:
-        report["check"] = check_of(error.get("details", {}).get("check"))
+        left = workspace.failed(stage) / CAPTURE_REPORT
+        found = json.loads(left.read_text("utf-8")) if left.is_file() else None
+        report["check"] = check_of(error.get("details", {}).get("check") or found)
     if said is not None:
         said = {key: value for key, value in said.items() if key not in _LONG}
     report |= {"state": "failed", "error": {"stage": stage, **shown}, "failed_report": said}

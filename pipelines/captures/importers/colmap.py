@@ -11,15 +11,20 @@ it stands already. Its points are kept. How files are read: `pipelines.captures.
 from __future__ import annotations
 
 import math
-import re
 import tempfile
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from pipelines.captures.archive_rules import shown
+from pipelines.captures.colmap_folders import (
+    MODEL_FILES,
+    SUFFIXES,
+    folders_of,
+    useful_folder,
+)
 from pipelines.captures.colmap_model import Image, Lens, read_cameras, read_images, read_points
 from pipelines.captures.contents import PosedPictures, PosedSource, SparsePoints
 from pipelines.captures.importer import Claim, Importer, Listing
@@ -37,56 +42,22 @@ from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 from pipelines.scene.natural_order import natural_key
 
-_SUFFIXES = (".bin", ".txt")
-_COMMENTS = rb"(\xef\xbb\xbf)?(\s*#[^\n]*\n)*\s*"
-_TEXTS = {
-    "cameras": re.compile(
-        rb"\s*#\s*(Camera list|CAMERA_ID)|" + _COMMENTS + rb"[0-9]+\s+[A-Z_]+\s+[0-9]+\s"
-    ),
-    "images": re.compile(
-        rb"\s*#\s*(Image list|IMAGE_ID)|" + _COMMENTS + rb"[0-9]+(\s+[-+.0-9a-zA-Z]+){7}\s+[0-9]+\s"
-    ),
-}
-"""How the texts start: with COLMAP's comments, or with others or none and a camera or an image."""
-_MOST_LISTED = 1 << 24
 _MOST_MODELS = 200
-_FILES = ("cameras", "images", "points3D", "frames", "rigs")
 
 Read = TypeVar("Read")
 
 
 def claims(listing: Listing) -> Claim | None:
-    """An archive with a file of cameras beside one of images, the least deep ones."""
-    found = [
-        (folder.count("/"), folder, suffix)
-        for suffix in _SUFFIXES
-        for folder in _folders(listing.heads, suffix)
-        if all(_is_list(listing.heads, folder, what, suffix) for what in _TEXTS)
-    ]
-    if not found:
+    """An archive with a file of cameras beside one of images, the least deep ones.
+
+    Beside pictures one of these must be of use: what another program left behind there, about other
+    pictures or broken, takes nobody's photos for posed ones.
+    """
+    found = useful_folder(listing)
+    if found is None:
         return None
-    _, folder, suffix = min(found)
+    folder, suffix = found
     return Claim(folder, f"cameras{suffix} beside images{suffix}")
-
-
-def _folders(names: Collection[str], suffix: str) -> list[str]:
-    """The folders with a model, "" or ending with "/", the least deep first."""
-    last = "images" + suffix
-    folders = [
-        name[: len(name) - len(last)]
-        for name in names
-        if (name == last or name.endswith("/" + last))
-        and name[: len(name) - len(last)] + "cameras" + suffix in names
-    ]
-    return sorted(folders, key=lambda folder: (folder.count("/"), folder))
-
-
-def _is_list(heads: Mapping[str, bytes], folder: str, what: str, suffix: str) -> bool:
-    """Whether a file of cameras or images starts as COLMAP writes it."""
-    head = heads[f"{folder}{what}{suffix}"]
-    if suffix == ".txt":
-        return _TEXTS[what].match(head) is not None
-    return len(head) >= 8 and int.from_bytes(head[:8], "little") < _MOST_LISTED
 
 
 @dataclass(frozen=True)
@@ -192,7 +163,7 @@ def _models(
     found: dict[str, _Model] = {}
     faults: list[CaptureError] = []
     places = [
-        (folder, suffix) for suffix in _SUFFIXES for folder in _folders(archive.names, suffix)
+        (folder, suffix) for suffix in SUFFIXES for folder in folders_of(archive.names, suffix)
     ]
     places.sort(key=lambda place: (place[0].count("/"), place))
     for folder, suffix in places[:_MOST_MODELS]:
@@ -264,7 +235,7 @@ def _passed_over(archive: CaptureArchive, models: Sequence[_Model]) -> None:
     """Ask for no word on files that repeat the model, in the other form or by rigs and frames, and
     on those of models that a warning of their own tells of."""
     for model in models:
-        archive.told(f"{model.folder}{what}{suffix}" for what in _FILES for suffix in _SUFFIXES)
+        archive.told(f"{model.folder}{what}{suffix}" for what in MODEL_FILES for suffix in SUFFIXES)
 
 
 IMPORTER = Importer(

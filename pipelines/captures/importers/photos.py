@@ -6,6 +6,7 @@ can be decoded: `pipelines.captures.photo_choice`.
 
 from __future__ import annotations
 
+from pipelines.captures.colmap_folders import MODEL_FILES, fault_of, model_folders
 from pipelines.captures.contents import Photos
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.unpack import CaptureArchive
@@ -17,8 +18,16 @@ def claims(listing: Listing) -> Claim | None:
 
 
 def read(archive: CaptureArchive, claim: Claim) -> Photos:
-    """All pictures of the archive, in no order."""
+    """All pictures of the archive, in no order. Why models beside them are not used is said."""
     del claim
+    listing = Listing(
+        {name: archive.head(name) for name in archive.names},
+        copy=archive.copy,
+        num_bytes={name: archive.num_bytes(name) for name in archive.names},
+    )
+    for folder, suffix in model_folders(listing):
+        files = {f"{folder}{what}{suffix}" for what in MODEL_FILES} & archive.names
+        archive.set_aside(files, f"a COLMAP model that {fault_of(listing, folder, suffix)}")
     return Photos(sorted(archive.images))
 
 

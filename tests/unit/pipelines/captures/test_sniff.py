@@ -141,11 +141,16 @@ def test_photos_beside_files_of_other_things_stay_photos(
     assert sniff(write_zip(tmp_path / "c", photos | files), "c.zip").kind == "images"
 
 
+PINHOLE = "1 PINHOLE 6 4 5 5 3 2"
+POSE = f"1 1 {'0 ' * 6} 1 1.jpg"
+
+
 @pytest.mark.parametrize(
     ("kind", "files"),
     [
-        ("colmap", {"cameras.txt": "#\n1 PINHOLE 6 4 5 5 3 2", "images.txt": f"1 {'0 ' * 7} 1 a"}),
-        ("colmap", {"cameras.txt": "# CAMERA_ID", "images.txt": "# Image list with two lines"}),
+        ("colmap", {"cameras.txt": f"#\n{PINHOLE}", "images.txt": POSE}),
+        ("colmap", {"cameras.txt": "# CAMERA_ID", "images.txt": f"# Image list with two\n{POSE}"}),
+        ("images", {"cameras.txt": f"#\n{PINHOLE}", "images.txt": POSE.replace("1.jpg", "9.jpg")}),
         ("metashape", {"a.xml": '<document version="2.1.0">\r\n  <chunk label="1">'}),
         ("realitycapture", {"a.csv": "#name,alt,x,y,heading,pitch,roll,f"}),
         ("opensfm", {"reconstruction.json": '[\n    {\n        "cameras"'}),

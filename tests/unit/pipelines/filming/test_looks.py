@@ -90,3 +90,33 @@ def test_a_large_file_is_looked_at_small(tmp_path: Path) -> None:
     (tmp_path / "b.jpg").write_bytes(b"no picture")
     with pytest.raises(OSError, match="cannot identify"):
         look_at(tmp_path / "b.jpg")
+
+
+def cut_out(ground: int) -> np.ndarray:
+    """A subject in the middle of a ground that somebody filled in."""
+    canvas = np.full((480, 640), float(ground))
+    canvas[120:400, 60:560] = picture()[120:400, 60:560]
+    return canvas
+
+
+@pytest.mark.parametrize("ground", [0, 255])
+def test_a_ground_around_a_cut_out_subject_is_neither_dark_nor_burnt_out(ground: int) -> None:
+    look = look_of(cut_out(ground))
+    assert max(look.bright, look.dark) < 0.05
+    assert look.luma > 0.3
+
+
+def test_a_subject_that_is_burnt_out_is_so_on_white_as_well() -> None:
+    canvas = cut_out(255)
+    canvas[200:320, 100:520] = 255
+    assert look_of(canvas).bright > 0.3
+
+
+def test_a_burnt_out_sky_and_a_black_film_stay_what_they_are() -> None:
+    sky = picture()
+    sky[:230] = 255
+    assert look_of(sky).bright > 0.4
+    night = np.zeros((480, 640))
+    night[230:240, 300:310] = 90
+    assert look_of(night).dark > 0.9
+    assert look_of(night).luma < 0.01

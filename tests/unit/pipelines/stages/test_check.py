@@ -123,6 +123,12 @@ def out_of_memory(options: Any, ctx: StageContext) -> dict[str, Any]:
     raise ResourceError("No memory.", code="out_of_memory")
 
 
+def breaks_down(options: Any, ctx: StageContext) -> dict[str, Any]:
+    """A stage `poses` with a fault in it."""
+    del options, ctx
+    raise ZeroDivisionError("/secret/path")
+
+
 def failing(how: str) -> Any:
     return dataclasses.replace(get_stage("poses"), run=f"{__name__}:{how}")
 
@@ -151,6 +157,19 @@ def test_a_machine_that_fails_is_no_verdict(film: Workspace) -> None:
         run_stage(failing("out_of_memory"), {}, film)
     assert caught.value.details["check"]["verdict"] is None
     assert {path.name for path in film.failed("poses").iterdir()} == REPORTS
+
+
+def test_a_stage_that_breaks_down_leaves_the_report_of_the_capture_too(film: Workspace) -> None:
+    with pytest.raises(ZeroDivisionError):
+        run_stage(failing("breaks_down"), {}, film)
+    assert {path.name for path in film.failed("poses").iterdir()} == REPORTS
+    page = (film.failed("poses") / "capture-report.html").read_text()
+    assert "/secret/path" not in page
+    error = {"code": "internal_error", "message": "The stage poses failed.", "hint": ""}
+    path = write_failed_report_locally(film, "poses", error)
+    job = json.loads(path.read_text())
+    assert (job["check"]["verdict"], len(job["check"]["reasons"])) == (None, 1)
+    assert {file.name for file in path.parent.iterdir()} > REPORTS
 
 
 def test_what_goes_wrong_while_explaining_does_not_hide_the_failure(

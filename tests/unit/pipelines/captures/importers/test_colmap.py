@@ -27,7 +27,6 @@ from tests.unit.pipelines.captures.ingesting import (
     Files,
     assert_poses,
     cameras,
-    code_of,
     failure,
     ingest,
     sources,
@@ -256,14 +255,10 @@ def rewritten(old: str, new: str, name: str = "images.txt") -> dict[str, bytes]:
     ("old", "new", "name"),
     [
         (" 1 left/", " 9 left/", "images.txt"),
-        (" 1 left/IMG_10.jpg", "", "images.txt"),
-        ("\n99 ", "\n99 0 0 0 0 ", "images.txt"),
         ("OPENCV", "FOV", "cameras.txt"),
-        ("64 48", "64", "cameras.txt"),
         ("64 48", "0 0", "cameras.txt"),
         ("61.5", "nan", "cameras.txt"),
         ("61.5", "1e999", "cameras.txt"),
-        ("-0.0", "nan", "cameras.txt"),
     ],
 )
 def test_faults_are_refused_by_name(tmp_path: Path, old: str, new: str, name: str) -> None:
@@ -272,9 +267,40 @@ def test_faults_are_refused_by_name(tmp_path: Path, old: str, new: str, name: st
     assert any(word in error.message for word in ("IMG_", "cameras.txt", "images.txt"))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "name"),
+    [
+        (" 1 left/IMG_10.jpg", "", "images.txt"),
+        ("\n99 ", "\n99 0 0 0 0 ", "images.txt"),
+        ("64 48", "64", "cameras.txt"),
+        ("-0.0", "nan", "cameras.txt"),
+        ("IMG_", "DSC_other_", "images.txt"),
+    ],
+)
+def test_a_model_of_no_use_is_told_and_leaves_plain_photos(
+    tmp_path: Path, old: str, new: str, name: str
+) -> None:
+    """Cut off, garbled, or about other pictures: what another program left beside the photos."""
+    files = PICTURES | rewritten(old, new, name)
+    assert sniff(write_zip(tmp_path / "c.zip", files), "c").kind == "images"
+    summary, ctx = ingest(tmp_path / "job", files)
+    assert (summary["kind"], summary["num_images"]) == ("images", 10)
+    assert not (ctx.out / "cameras.json").exists()
+    why = "names none of the pictures" if "other" in new else "cannot be read ("
+    assert warning_with(summary, "sparse/0/", "a COLMAP model that", why)
+
+
+def test_a_useful_model_behind_a_broken_one_is_read(tmp_path: Path) -> None:
+    left = {"a.bin": b"", **colmap_files(TRUTH, folder="")}
+    left["images.bin"] = left["images.bin"][:200]
+    summary, ctx = ingest(tmp_path, PICTURES | left | colmap_files(TRUTH, folder="sparse/1/"))
+    assert summary["kind"] == "colmap"
+    assert_poses(ctx, TRUTH)
+
+
 @pytest.mark.parametrize("form", ["binary", "text"])
 @pytest.mark.parametrize("what", ["images", "cameras"])
-def test_more_than_a_model_may_have_is_refused(
+def test_a_model_with_more_than_it_may_have_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, what: str
 ) -> None:
     truth = walked(*(replace(TRUTH.cameras[0], fl_x=60.0 + n) for n in range(9)), num=9)
@@ -286,8 +312,9 @@ def test_more_than_a_model_may_have_is_refused(
     else:
         truth = replace(truth, cameras=(*truth.cameras, truth.cameras[0]))
     files = pictures_of(truth) | colmap_files(truth, form=form)
-    error = failure(tmp_path / "more", files)
-    assert (error.code, f"more than 9 {what}" in error.message) == ("poses_malformed", True)
+    summary, _ = ingest(tmp_path / "more", files)
+    assert summary["kind"] == "images"
+    assert warning_with(summary, f"more than 9 {what}")
 
 
 def test_of_very_many_models_some_are_looked_at_and_that_is_told(
@@ -302,9 +329,11 @@ def test_of_very_many_models_some_are_looked_at_and_that_is_told(
     assert warning_with(summary, "cannot be read: of 3 the first 2")
 
 
-def test_an_empty_list_has_no_poses(tmp_path: Path) -> None:
+def test_an_empty_list_is_a_list_of_other_pictures(tmp_path: Path) -> None:
     empty = {"sparse/0/cameras.bin": b"\0" * 8, "sparse/0/images.bin": b"\0" * 8}
-    assert code_of(tmp_path, PICTURES | empty) == "poses_missing"
+    summary, _ = ingest(tmp_path, PICTURES | empty)
+    assert summary["kind"] == "images"
+    assert warning_with(summary, "names none of the pictures")
 
 
 def test_one_bad_pose_in_ten_is_left_out_by_name(tmp_path: Path) -> None:
