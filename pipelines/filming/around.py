@@ -38,8 +38,8 @@ class Around:
 
     @property
     def covered_deg(self) -> float:
-        """How much of the way around was seen."""
-        return float(self.covered.sum()) * 360.0 / NUM_SECTORS
+        """How much of the way around was seen, whichever way +X points."""
+        return 360.0 - float(self._unseen_deg.sum())
 
     @property
     def heights_deg(self) -> float:
@@ -50,14 +50,15 @@ class Around:
     @property
     def widest_gap_deg(self) -> float:
         """The longest run of directions from which nothing was seen."""
-        if self.covered.all():
-            return 0.0
-        doubled = np.concatenate([self.covered, self.covered])
-        longest = run = 0
-        for covered in doubled:
-            run = 0 if covered else run + 1
-            longest = max(longest, run)
-        return min(longest, NUM_SECTORS) * 360.0 / NUM_SECTORS
+        return float(self._unseen_deg.max())
+
+    @property
+    def _unseen_deg(self) -> Floats:
+        """[N], behind each camera on the way around, how far nobody saw the subject from."""
+        ahead = np.sort(self.azimuth)
+        gaps = np.diff(np.append(ahead, ahead[0] + 360.0))
+        unseen: Floats = np.maximum(gaps - 2 * _REACH_DEG, 0.0)
+        return unseen
 
 
 def look_around(poses: Floats) -> Around | None:

@@ -302,8 +302,8 @@ def _directions(take: Take) -> list[Finding]:
     if around is None or take.error is not None:
         return []
     measured = {
-        "covered_deg": around.covered_deg,
-        "widest_gap_deg": around.widest_gap_deg,
+        "covered_deg": round(around.covered_deg, 1),
+        "widest_gap_deg": round(around.widest_gap_deg, 1),
         "heights_deg": round(around.heights_deg, 1),
     }
     found = []

@@ -52,8 +52,8 @@ def build_report(take: Take, thresholds: Thresholds | None = None) -> dict[str, 
         "around": None
         if around is None
         else {
-            "covered_deg": around.covered_deg,
-            "widest_gap_deg": around.widest_gap_deg,
+            "covered_deg": round(around.covered_deg, 1),
+            "widest_gap_deg": round(around.widest_gap_deg, 1),
             "heights_deg": round(around.heights_deg, 1),
             "sectors": [bool(seen) for seen in around.covered],
         },

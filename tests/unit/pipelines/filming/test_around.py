@@ -20,8 +20,15 @@ def test_a_full_round_is_covered() -> None:
 def test_an_arc_is_covered_as_far_as_it_goes(arc: float) -> None:
     around = look_around(ring(60, around_deg=arc))
     assert around is not None
-    assert around.covered_deg == pytest.approx(arc + 20.0, abs=10.0)
+    assert around.covered_deg == pytest.approx(arc * 59 / 60 + 20.0)
     assert around.widest_gap_deg == pytest.approx(360.0 - around.covered_deg)
+    turn = np.radians(7.0)
+    across = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
+    turned = look_around(across @ ring(60, around_deg=arc))
+    assert turned is not None
+    assert turned.covered_deg == pytest.approx(around.covered_deg), "whichever way +X points"
 
 
 def test_two_arcs_leave_two_gaps() -> None:

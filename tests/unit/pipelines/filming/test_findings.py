@@ -117,7 +117,7 @@ def test_soft_pictures_that_have_a_pose() -> None:
 
 def test_sides_that_were_not_seen() -> None:
     take = replace(good_take(), poses=ring(NUM, around_deg=120.0))
-    assert "140 of 360" in the_one(take, "part_unseen")
+    assert "137 of 360" in the_one(take, "part_unseen")
     assert verdict_of(take, find(take))[0] == "good"
     assert codes(replace(take, poses=ring(NUM, around_deg=30.0))) == ["few_directions"]
     assert codes(replace(take, poses=ring(NUM, elevation_deg=0.0))) == ["one_height"]
