@@ -20,7 +20,7 @@ from api import catalogue, errors, health, workers
 from api.artifacts import endpoints as artifacts
 from api.captures import endpoints as captures
 from api.captures.receiving import sweep
-from api.deps import MAX_STORE_CALLS, Services, require_key
+from api.deps import MAX_CREATIONS, MAX_STORE_CALLS, Services, require_key
 from api.documentation import page_of
 from api.exports import endpoints as exports
 from api.jobs import endpoints as jobs
@@ -66,6 +66,7 @@ def open_services(settings: ApiSettings) -> Services:
             Probe("object_store", store.ping),
         ),
         threading.BoundedSemaphore(MAX_STORE_CALLS),
+        asyncio.Semaphore(MAX_CREATIONS),
         threading.BoundedSemaphore(settings.max_uploads),
     )
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
 
 from api.probes import Probe
 from api.problems import UnauthorizedError, UnavailableError
@@ -23,6 +26,8 @@ from storage.objects import ObjectStore
 MAX_KEY_CHARS = 256
 MAX_STORE_CALLS = 8
 STORE_TURN_S = 1.0
+MAX_CREATIONS = 2
+CREATE_TURN_S = 60.0
 DELETE_WAIT_S = 2.0
 
 
@@ -38,6 +43,8 @@ class Services:
     probes: tuple[Probe, ...]
     store_calls: threading.BoundedSemaphore
     """Held by a request that waits for the object store: a store that hangs stops only so many."""
+    creations: asyncio.Semaphore
+    """Held while a job is recorded (`creating`)."""
     uploads: threading.BoundedSemaphore
     """Held by an upload from its first byte to its answer."""
 
@@ -52,6 +59,25 @@ class Services:
             yield
         finally:
             self.uploads.release()
+
+    async def creating(self, create: Callable[[], Response]) -> Response:
+        """Run what records a job in a thread, MAX_CREATIONS at a time, in the order of arrival.
+
+        It is Python's work for the most part, which one thread does at a time: more at once would
+        be no faster, and keep those waiting who only read. Who waits here holds no thread. Raises
+        UnavailableError where those before take too long, as they do where the database hangs.
+        """
+        try:
+            async with asyncio.timeout(CREATE_TURN_S):
+                await self.creations.acquire()
+        except TimeoutError as error:
+            raise UnavailableError(
+                "The database does not answer.", code="database_unavailable"
+            ) from error
+        try:
+            return await run_in_threadpool(create)
+        finally:
+            self.creations.release()
 
     @contextmanager
     def asking_the_store(self) -> Iterator[None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import ExitStack
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -122,7 +123,7 @@ def get_capture(capture_id: CaptureId, services: ServicesDep) -> CaptureView:
     },
     response_model=JobView,
 )
-def check_capture(
+async def check_capture(
     capture_id: CaptureId,
     services: ServicesDep,
     caller: CallerDep,
@@ -143,7 +144,7 @@ def check_capture(
     job = JobRequest(
         capture_id=capture_id, preset=CHECK, options=wanted.options, labels=wanted.labels
     )
-    answer = create_job(services, job, once, request)
+    answer = await services.creating(partial(create_job, services, job, once, request))
     answer.headers["Retry-After"] = POLL_S
     return answer
 

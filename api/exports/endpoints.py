@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -29,7 +30,7 @@ router = APIRouter(prefix="/v1", tags=["exports"])
     },
     response_model=JobView,
 )
-def create_export(
+async def create_export(
     job_id: JobId,
     wanted: ExportRequest,
     services: ServicesDep,
@@ -43,7 +44,9 @@ def create_export(
     """
     call = f"POST /v1/jobs/{job_id}/exports"
     once = Once.of(caller, call, idempotency_key, wanted.model_dump_json())
-    answer = service.create(services, job_id, wanted, once, request)
+    answer = await services.creating(
+        partial(service.create, services, job_id, wanted, once, request)
+    )
     answer.headers["Retry-After"] = POLL_S
     return answer
 

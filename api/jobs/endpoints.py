@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Query, Request, Response
@@ -55,7 +56,7 @@ def _hint_poll(response: Response, job: JobView) -> None:
     },
     response_model=JobView,
 )
-def create_job(
+async def create_job(
     wanted: JobRequest,
     services: ServicesDep,
     caller: CallerDep,
@@ -64,7 +65,7 @@ def create_job(
 ) -> Response:
     """Make a capture into assets. The answer's `Location` is the job's address."""
     once = Once.of(caller, "POST /v1/jobs", idempotency_key, wanted.model_dump_json())
-    answer = service.create(services, wanted, once, request)
+    answer = await services.creating(partial(service.create, services, wanted, once, request))
     answer.headers["Retry-After"] = POLL_S
     return answer
 
@@ -124,7 +125,7 @@ def cancel_job(
     responses=responses(*RETRY, *BODY, *ONCE),
     response_model=JobView,
 )
-def retry_job(
+async def retry_job(
     job_id: JobId,
     services: ServicesDep,
     caller: CallerDep,
@@ -139,7 +140,9 @@ def retry_job(
     wanted = wanted or RetryRequest()
     call = f"POST /v1/jobs/{job_id}/retry"
     once = Once.of(caller, call, idempotency_key, wanted.model_dump_json())
-    answer = service.retry(services, job_id, wanted, once, request)
+    answer = await services.creating(
+        partial(service.retry, services, job_id, wanted, once, request)
+    )
     answer.headers["Retry-After"] = POLL_S
     return answer
 

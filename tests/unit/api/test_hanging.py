@@ -11,10 +11,13 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
+from api.deps import MAX_CREATIONS
+from api.jobs import service as jobs
 from storage.claims import claim_stage
 from storage.db import Database
 from storage.jobs import StageSeed, stage_id
@@ -66,6 +69,45 @@ def test_a_broker_that_hangs_slows_no_call(tmp_path: Path, gate: MakeGate) -> No
         assert {answer.status_code for answer in answers} == {202}
         refused = problem(service.anyone.get("/readyz"), 503, "not_ready")
         assert [wrong["path"] for wrong in refused["errors"]] == ["broker"]
+
+
+def test_calls_that_create_wait_for_their_turn_and_those_that_read_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More wait than there are threads for calls, and a read still gets one."""
+    gate = threading.Event()
+    made = jobs.create
+
+    def slow(*given: Any) -> Any:
+        assert gate.wait(300)
+        return made(*given)
+
+    def post() -> httpx.Response:
+        return service.http.post("/v1/jobs", json={"capture_id": capture}, timeout=300)
+
+    with serving(settings_for(tmp_path / "home")) as service:
+        job = service.job()
+        capture = job["capture_id"]
+        monkeypatch.setattr("api.jobs.service.create", slow)
+        monkeypatch.setattr("api.deps.CREATE_TURN_S", 300.0)
+        with many(post, 45) as answers:  # starlette has 40 threads
+            try:
+                assert service.anyone.get("/livez").status_code == 200
+                assert service.http.get(f"/v1/jobs/{job['id']}").status_code == 200
+            finally:
+                gate.set()
+        assert {answer.status_code for answer in answers} == {202}
+        monkeypatch.setattr("api.deps.CREATE_TURN_S", 0.1)
+        gate.clear()
+        with many(post, MAX_CREATIONS) as answers:
+            try:
+                while not service.services.creations.locked():
+                    time.sleep(0.01)
+                refused = post()
+                problem(refused, 503, "database_unavailable")
+            finally:
+                gate.set()
+        assert {answer.status_code for answer in answers} == {202}
 
 
 @pytest.mark.services
