@@ -76,6 +76,12 @@ def z_up_from_y_up(rows: Rows) -> Rows:
     return (rows[2], rows[0], rows[1])
 
 
+def arkit_notes() -> dict[str, Any]:
+    """Notes of a world whose poses `z_up_from_y_up` has turned, and what that was."""
+    turn = [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
+    return {"world": "ARKit, turned to +Z up", "applied_transform": turn}
+
+
 def rotation_of(quaternion: Sequence[float], what: str) -> Rows:
     """The rotation of a quaternion (x, y, z, w) of any length but zero. Rows [3, 3].
 

@@ -17,6 +17,7 @@ from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.options import CropShapeOptions
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.depth_views import DepthView
+from pipelines.scene.orientation import Similarity
 
 Floats = NDArray[np.float64]
 
@@ -28,13 +29,15 @@ _NEAR_PX = 2.0
 class Crop:
     """center: [3]. axes: [3, 3], the box's own axes in its columns. half: [3], half of its sides.
 
-    radius: of a ball, which has no axes and half; None for a box.
+    radius: of a ball, which has no axes and half; None for a box. frame_from_world: the way to the
+    frame that it was given in, where that is not the world: what is told of it is told there.
     """
 
     center: Floats
     axes: Floats
     half: Floats
     radius: float | None = None
+    frame_from_world: Similarity | None = None
 
     def distance(self, points: Floats) -> Floats:
         """[...] how far points [..., 3] are outside, 0 for those inside."""
@@ -124,13 +127,18 @@ def empty_crop(crop: Crop, points: Floats, kind: str) -> ExportError:
     """The error for a crop that holds nothing. points: [P, 3] of the surface around it."""
     outside = crop.distance(points) > 0.0
     nearest = float(crop.distance(points).min()) if len(points) else 0.0
+    where = "the world of cameras.json"
+    if crop.frame_from_world is not None:
+        nearest *= crop.frame_from_world.scale
+        points = crop.frame_from_world.apply_to_points(points)
+        where = "the frame that is asked for"
     low, high = (end(points, axis=0) if len(points) else np.zeros(3) for end in (np.min, np.max))
     return ExportError(
         f"The crop of {kind} holds no surface: {outside.sum()} of {len(points)} points of it lie "
         f"outside, the nearest {nearest:.4g} away.",
         code="export.empty",
-        hint=f"The surface reaches from {_told(low)} to {_told(high)}, in the world of "
-        f"cameras.json; change {kind}.crop.",
+        hint=f"The surface reaches from {_told(low)} to {_told(high)}, in {where}; change "
+        f"{kind}.crop.",
         details={
             "num_points": len(points),
             "num_outside": int(outside.sum()),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
+from pipelines.exports.frame import FrameName
 from pipelines.nerf.options.render import RenderConfig
 from pipelines.nerf.options.train import config_from_dict
 from pipelines.option_models import StageOptions, model_of
@@ -21,6 +22,17 @@ class RenderingOptions(StageOptions):
 
     render: RenderOptions = Field(
         default_factory=lambda: RenderOptions(), description="What rendering leaves out."
+    )
+
+
+class FrameOptions(StageOptions):
+    """Where an export lies."""
+
+    frame: FrameName = Field(
+        "gravity",
+        description="gravity is the world of cameras.json: up is up, in metres where it is metric; "
+        "source that of the capture's own poses, where it brought some; normalised has the origin "
+        "where the cameras look and the largest coordinate of a camera at 1.",
     )
 
 
@@ -66,24 +78,24 @@ _Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
 class CropShapeOptions(StageOptions):
-    """A part of the scene, cut out by hand, in the world of cameras.json."""
+    """A part of the scene, cut out by hand, in the frame of the export."""
 
     shape: Literal["none", "box", "sphere"] = Field("none", description="What is kept.")
     center: tuple[_World, _World, _World] = Field(
-        (0.0, 0.0, 0.0), description="Its middle, x, y and z. Unit: the world's."
+        (0.0, 0.0, 0.0), description="Its middle, x, y and z. Unit: the frame's."
     )
     size: tuple[_Side, _Side, _Side] = Field(
-        (1.0, 1.0, 1.0), description="Sides of the box, along its own axes. Unit: the world's."
+        (1.0, 1.0, 1.0), description="Sides of the box, along its own axes. Unit: the frame's."
     )
     rotation_deg: tuple[_Degrees, _Degrees, _Degrees] = Field(
         (0.0, 0.0, 0.0),
-        description="Turns of the box about the world's x axis, then y, then z, counter-clockwise. "
+        description="Turns of the box about the frame's x axis, then y, then z, counter-clockwise. "
         "Unit: degrees.",
     )
-    radius: float = Field(1.0, gt=0, le=1e6, description="Of the sphere. Unit: the world's.")
+    radius: float = Field(1.0, gt=0, le=1e6, description="Of the sphere. Unit: the frame's.")
 
 
-class CropOptions(RenderingOptions, ExtentOptions):
+class CropOptions(RenderingOptions, ExtentOptions, FrameOptions):
     """Common to mesh and point cloud."""
 
     crop: CropShapeOptions = Field(

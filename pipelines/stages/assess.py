@@ -21,6 +21,7 @@ from PIL import Image
 from pipelines.errors import ExportError
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import Ply, read_ply
+from pipelines.exports.frame import back_to_world
 from pipelines.exports.mesh import TexturedMesh
 from pipelines.judging.asset_scores import DEFINITIONS, mean_scores, picture_of, score_view
 from pipelines.judging.asset_views import (
@@ -175,7 +176,7 @@ class _Seen:
 
 
 def _caster(folder: Path, frame: SceneTransform) -> MeshCaster:
-    """The mesh as it is delivered: with its texture, where it has one."""
+    """The mesh as it is delivered, back from its frame: with its texture, where it has one."""
     mesh = read_mesh(folder / "mesh.glb")
     vertices = frame.scene_from_world(mesh.vertices)
     if isinstance(mesh, TexturedMesh):
@@ -203,7 +204,7 @@ def _look_at_cloud(
     cloud: Ply, views: Views, ctx: StageContext
 ) -> tuple[list[dict[str, float | None]], float]:
     """The rows of the cloud, drawn with its own spacing as radius, and the median spacing."""
-    points = views.frame.scene_from_world(cloud.points)
+    points = views.frame.scene_from_world(back_to_world(cloud.points, cloud.from_world))
     grey = np.full((len(points), 3), 128, np.uint8)
     colors = (grey if cloud.colors is None else cloud.colors).astype(np.float32) / 255.0
     ctx.progress(0.5, "measuring the cloud's spacing")

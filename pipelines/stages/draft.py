@@ -17,6 +17,7 @@ from PIL import Image
 
 from pipelines.errors import ExportError
 from pipelines.exports.formats import glb
+from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import reach_of
 from pipelines.exports.surface.shells import find_shells, fuse_shells
@@ -67,7 +68,7 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
     if len(mesh.faces) == 0:
         return _nothing(options, ctx, "no two depth maps agree on a surface")
     skin = _painted(mesh, maps, cameras, options, ctx)
-    glb.write_mesh(ctx.out / "draft.glb", skin, cameras.metric)
+    glb.write_mesh(ctx.out / "draft.glb", skin, Frame(metric=cameras.metric))
     _save_picture(ctx.out / "draft.jpg", skin, probes[len(probes) // 2], shells[0].bounds.focus)
     return {
         "num_faces": len(mesh.faces),

@@ -23,7 +23,7 @@ from typing import Any
 from pipelines.captures.contents import PosedPictures, PosedSource
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.named_files import NamedFiles
-from pipelines.captures.parsing import malformed, number, numbers, z_up_from_y_up
+from pipelines.captures.parsing import arkit_notes, malformed, number, numbers, z_up_from_y_up
 from pipelines.captures.transforms_json import (
     LARGEST,
     Values,
@@ -70,7 +70,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         failures=listed.failures,
         metric=is_arkit or top.get(_METRIC) is True,
         up="known" if is_arkit or top.get(_ORIENTATION) == "none" else "assumed",
-        notes={"world": "ARKit, turned to +Z up"} if is_arkit else _notes(top) | motion,
+        notes=arkit_notes() if is_arkit else _notes(top) | motion,
         details={
             "num_listed": len(frames),
             "num_missing": listed.num_missing,

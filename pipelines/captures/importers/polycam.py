@@ -23,6 +23,7 @@ from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.parsing import (
+    arkit_notes,
     each_frame,
     malformed,
     missing,
@@ -87,7 +88,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         failures=failures,
         metric=True,
         is_dense=True,
-        notes={"corrected": corrected, "world": "ARKit, turned to +Z up"},
+        notes={"corrected": corrected, **arkit_notes()},
         details={
             "corrected": corrected,
             "num_frames": len(pairs),

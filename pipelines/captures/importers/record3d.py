@@ -19,6 +19,7 @@ from typing import Any
 from pipelines.captures.contents import PosedPictures, PosedSource, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.parsing import (
+    arkit_notes,
     each_frame,
     malformed,
     missing,
@@ -81,7 +82,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         failures=failures,
         metric=True,
         is_dense=True,
-        notes={"world": "ARKit, turned to +Z up"},
+        notes=arkit_notes(),
         details={"num_poses": len(poses), "num_frames": len(files)},
         warnings=_gaps(files, len(poses)) + _without_depth(usable, depths),
     )

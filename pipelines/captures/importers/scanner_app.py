@@ -24,6 +24,7 @@ from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, Rows, SensorDepth
 from pipelines.captures.importer import Claim, Importer, Listing
 from pipelines.captures.parsing import (
+    arkit_notes,
     each_frame,
     malformed,
     missing,
@@ -93,7 +94,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         failures=failures,
         metric=True,
         is_dense=True,
-        notes={"world": "ARKit, turned to +Z up"},
+        notes=arkit_notes(),
         details={"num_poses": len(poses), "num_frames": len(pictures)},
         warnings=_gaps(pictures, poses) + _without_depth(usable, depths),
     )

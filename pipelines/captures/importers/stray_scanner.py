@@ -32,6 +32,7 @@ from pipelines.captures.matrix_files import (
 from pipelines.captures.orders import numbered
 from pipelines.captures.parsing import (
     FRAME_FAULTS,
+    arkit_notes,
     malformed,
     missing,
     most_failures,
@@ -115,7 +116,7 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
         failures=failures,
         metric=True,
         is_dense=True,
-        notes={"world": "ARKit, turned to +Z up"},
+        notes=arkit_notes(),
         details={"num_poses": len(lines) - 1},
         warnings=_without_depth(sources, depths),
     )

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from pipelines.errors import ExportError
 from pipelines.exports.formats.archive import entry
+from pipelines.exports.frame import Frame
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics
 from pipelines.scene.rotations import quaternions
 
@@ -51,6 +52,7 @@ _POINT = np.dtype(
 )
 """Of points3D.bin; how many images saw it, by their keypoints, is none."""
 _GREY = 127
+_WORLD = Frame()
 
 
 @dataclass(frozen=True)
@@ -72,19 +74,38 @@ class _Image:
     name: str
 
 
-def write_colmap(path: Path, cameras: CamerasFile) -> None:
-    """Write the zip, without points. Raises ExportError for a lens that COLMAP has no model for."""
-    _write(path, model_files(cameras, "text") | model_files(cameras, "binary"))
+def write_colmap(path: Path, cameras: CamerasFile, frame: Frame = _WORLD) -> None:
+    """Write the zip, without points. frame: that in which the cameras lie.
+
+    Raises ExportError for a lens that COLMAP has no model for.
+    """
+    files = model_files(cameras, "text") | model_files(cameras, "binary")
+    _write(path, files | frame_file(frame))
 
 
 def write_colmap_points(
-    path: Path, cameras: CamerasFile, points: Floats, colors: NDArray[np.uint8]
+    path: Path,
+    cameras: CamerasFile,
+    points: Floats,
+    colors: NDArray[np.uint8],
+    frame: Frame = _WORLD,
 ) -> None:
     """Write the zip with points and no text, which would be long.
 
-    points: [P, 3] world. colors: [P, 3], sRGB. Raises ExportError as `check_lenses`.
+    points: [P, 3] where the cameras are, in `frame`. colors: [P, 3], sRGB. Raises ExportError as
+    `check_lenses`.
     """
-    _write(path, model_files(cameras, "binary", points, colors))
+    _write(path, model_files(cameras, "binary", points, colors) | frame_file(frame))
+
+
+def frame_file(frame: Frame) -> dict[str, bytes]:
+    """`frame.txt`, which tells of a frame that is not the world of cameras.json; else no file.
+
+    COLMAP's own files have no room for that.
+    """
+    if frame.from_world is None:
+        return {}
+    return {"frame.txt": "".join(f"{line}\n" for line in frame.lines()).encode("ascii")}
 
 
 def model_files(

@@ -1,10 +1,11 @@
 """A triangle mesh as binary glTF 2.0 (`.glb`), with a texture or vertex colours, nothing to fetch.
 
 glTF is right-handed with +Y up, our world has +Z up: positions and normals are written turned
-(`pipelines.exports.frame`), since some readers ignore node transforms. `COLOR_0` is linear (glTF
-2.0, section 3.7.2.1), our colours are sRGB: they are converted, into 16-bit so that dark tones keep
-their steps. A texture is a JPEG, which is sRGB as base colours are, and lies in the file. A
-capture's colours contain the light, hence KHR_materials_unlit.
+(`pipelines.exports.frame`), since some readers ignore node transforms. Only where 32 bits would
+blur them, as in map coordinates, the node's translation has what is common to all. `COLOR_0` is
+linear (glTF 2.0, section 3.7.2.1), our colours are sRGB: they are converted, into 16-bit so that
+dark tones keep their steps. A texture is a JPEG, which is sRGB as base colours are, and lies in the
+file. A capture's colours contain the light, hence KHR_materials_unlit.
 
 Source: Khronos, glTF 2.0 specification; KHR_materials_unlit.
 """
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.exports.frame import Frame
+from pipelines.exports.frame import FROM_WORLD, Frame, back_to_world, is_far
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 
 Floats = NDArray[np.float64]
@@ -117,12 +118,13 @@ class GlbStyle:
 def write_mesh(
     path: Path,
     mesh: TriangleMesh | TexturedMesh,
-    metric: bool = False,
+    frame: Frame = Frame(),
     style: GlbStyle = GlbStyle(),
 ) -> None:
     """Write a mesh of our world, +Z up; its normals may have any length.
 
-    metric: whether a unit is a metre, as glTF would have it; `asset.extras.frame` says which.
+    frame: where the mesh lies, and whether a unit is a metre, as glTF would have it;
+    `asset.extras.frame` says it, and `from_world` beside it how it came there, if it was moved.
     Raises ValueError for an empty mesh, and where shapes or indices do not fit.
     """
     vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
@@ -132,7 +134,7 @@ def write_mesh(
         raise ValueError(f"normals {normals.shape} must be like {vertices.shape}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("a face names a vertex that does not exist")
-    frame = Frame("y", metric)
+    frame = frame.y_up()
     places, directions = frame.of_world(vertices), frame.of_world(unit_normals(normals))
     node: dict[str, Any] = {"mesh": 0, "name": "scene"}
     if style.quantized:
@@ -143,6 +145,10 @@ def write_mesh(
             _steps("NORMAL", np.rint(127.0 * directions), "<i1", _INT8),
         ]
     else:
+        if is_far(places):
+            middle = np.round(places.mean(axis=0))
+            places = places - middle
+            node["translation"] = middle.tolist()
         shape = [
             _Accessor("POSITION", places.astype("<f4"), "VEC3", _FLOAT),
             _Accessor("NORMAL", directions.astype("<f4"), "VEC3", _FLOAT),
@@ -155,7 +161,7 @@ def write_mesh(
     picture = jpeg(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
     # Arrays are multiples of 4 bytes by their types; the picture comes last and is padded.
     blobs = [accessor.values.tobytes() for accessor in accessors] + [picture] * bool(picture)
-    document = _document(accessors, len(picture), frame.note(), node, style)
+    document = _document(accessors, len(picture), frame, node, style)
     text = json.dumps(document, separators=(",", ":")).encode("utf-8")
     text += b" " * (-len(text) % 4)
     binary = b"".join(blobs)
@@ -170,9 +176,11 @@ def write_mesh(
 
 
 def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
-    """Read back what `write_mesh` wrote, into our world. Raises ValueError for another file."""
+    """Read back what `write_mesh` wrote, whatever its frame, into the world of cameras.json.
+
+    Raises ValueError for another file.
+    """
     document, binary = _parts(path)
-    frame = Frame("y")
     try:
         views = [
             binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
@@ -186,7 +194,7 @@ def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
         )
         (node,) = document["nodes"]
         placed = placed * node.get("scale", 1.0) + node.get("translation", 0.0)
-        position, normal = frame.to_world(placed), frame.to_world(unit_normals(turned))
+        position, normal = _in_world(document, placed, unit_normals(turned))
         faces = np.frombuffer(views[primitive["indices"]], "<u4").reshape(-1, 3).astype(np.int32)
         if "images" not in document:
             rgba = np.frombuffer(views[at["COLOR_0"]], "<u2").reshape(-1, 4)
@@ -199,6 +207,19 @@ def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
     except (KeyError, IndexError, TypeError, OSError, ValueError) as error:
         raise ValueError(f"{path.name} is no mesh of ours: {error}") from error
     return TexturedMesh(position, faces, normal, uv, texture)
+
+
+def _in_world(
+    document: dict[str, Any], places: Floats, directions: Floats
+) -> tuple[Floats, Floats]:
+    """Positions and unit directions [V, 3] of a file in the world of cameras.json."""
+    rows = document["asset"].get("extras", {}).get(FROM_WORLD)
+    if rows is None:
+        plain = Frame("y")
+        return plain.to_world(places), plain.to_world(directions)
+    matrix = np.asarray(rows, np.float64).reshape(3, 4)
+    # Turned back by the transpose, to which a similarity's inverse is proportional.
+    return back_to_world(places, matrix), unit_normals(directions @ matrix[:, :3])
 
 
 def _steps(name: str, values: Floats, kind: str, component: int) -> _Accessor:
@@ -256,7 +277,11 @@ def jpeg(texture: NDArray[np.uint8]) -> bytes:
 
 
 def _document(
-    accessors: list[_Accessor], picture_bytes: int, note: str, node: dict[str, Any], style: GlbStyle
+    accessors: list[_Accessor],
+    picture_bytes: int,
+    frame: Frame,
+    node: dict[str, Any],
+    style: GlbStyle,
 ) -> dict[str, Any]:
     """The JSON part. picture_bytes: of the texture behind all arrays, 0 for none."""
     views: list[dict[str, Any]] = []
@@ -272,8 +297,11 @@ def _document(
         key: value for key, value in _MATERIAL.items() if style.unlit or key != "extensions"
     }
     used = ["KHR_materials_unlit"] * style.unlit + [_QUANTIZATION] * style.quantized
+    extras: dict[str, Any] = {"frame": frame.note()}
+    if (matrix := frame.matrix()) is not None:
+        extras[FROM_WORLD] = matrix.tolist()
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "nerfworks", "extras": {"frame": note}},
+        "asset": {"version": "2.0", "generator": "nerfworks", "extras": extras},
         **({"extensionsUsed": used} if used else {}),
         **({"extensionsRequired": [_QUANTIZATION]} if style.quantized else {}),
         "scene": 0,

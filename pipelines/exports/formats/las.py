@@ -41,7 +41,9 @@ def write_points(
     header.scales = np.full(3, _step(positions))
     header.offsets = np.round(positions.mean(axis=0))
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f4")) for name in _NORMALS])
-    header.vlrs.append(laspy.VLR("nerfworks", _RECORD_ID, "frame", frame.note().encode("ascii")))
+    header.vlrs.append(
+        laspy.VLR("nerfworks", _RECORD_ID, "frame", "; ".join(frame.lines()).encode("ascii"))
+    )
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = positions.T
     cloud.red, cloud.green, cloud.blue = colors.astype(np.uint16).T * 257

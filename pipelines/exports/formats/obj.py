@@ -3,7 +3,7 @@
 `mesh.obj`, `mesh.mtl`, and `mesh.png` where the mesh is textured; else each vertex carries its
 colour behind its position (`v x y z r g b`, sRGB), which MeshLab, Blender and Open3D read. Texture
 coordinates of OBJ have their origin at the picture's bottom left. Numbers have nine digits, which
-hold a float32.
+hold a float32, and more where that would blur them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipelines.exports.formats.archive import entry
-from pipelines.exports.frame import Frame
+from pipelines.exports.frame import Frame, is_far
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 
 _ROWS = 50_000
@@ -42,16 +42,18 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, frame: Frame) -> N
 
 def _lines(mesh: TriangleMesh | TexturedMesh, frame: Frame) -> Iterator[str]:
     """The text of `mesh.obj`, in pieces."""
-    yield f"# nerfworks: {frame.note()}\nmtllib mesh.mtl\no mesh\n"
+    told = "\n# ".join(frame.lines())
+    yield f"# nerfworks: {told}\nmtllib mesh.mtl\no mesh\n"
     positions = frame.of_world(mesh.vertices)
+    place = " ".join(["%.15g" if is_far(positions) else "%.9g"] * 3)
     if isinstance(mesh, TexturedMesh):
-        yield from _rows("v %.9g %.9g %.9g\n", positions)
+        yield from _rows(f"v {place}\n", positions)
         up = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1)
         yield from _rows("vt %.9g %.9g\n", up)
         corner = "%d/%d/%d"
     else:
         colored = np.concatenate([positions, np.clip(mesh.colors, 0.0, 1.0)], axis=1)
-        yield from _rows("v %.9g %.9g %.9g %.4f %.4f %.4f\n", colored)
+        yield from _rows(f"v {place} %.4f %.4f %.4f\n", colored)
         corner = "%d//%d"
     yield from _rows("vn %.6f %.6f %.6f\n", frame.of_world(unit_normals(mesh.normals)))
     yield "usemtl captured\n"

@@ -1,9 +1,9 @@
 """PLY files: point clouds and triangle meshes with colours and normals, binary little endian.
 
-Symbols: V vertices, F triangles. Positions are float32, their axes are told in a comment,
-colours are sRGB uint8, normals are unit vectors. The reader understands what the writers here
-write and what common programs write: any scalar types, further properties (skipped), polygons
-(split into fans), binary little endian.
+Symbols: V vertices, F triangles. Positions are float32, or float64 where that would blur them, as
+in map coordinates; their axes are told in a comment, colours are sRGB uint8, normals are unit
+vectors. The reader understands what the writers here write and what common programs write: any
+scalar types, further properties (skipped), polygons (split into fans), binary little endian.
 
 Format: Greg Turk, "The PLY Polygon File Format", 1994.
 """
@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from pipelines.exports.frame import Frame
+from pipelines.exports.frame import Frame, is_far, matrix_of
 from pipelines.exports.mesh import TriangleMesh
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -43,6 +43,7 @@ _SCALARS = {
     "double": "<f8",
     "float64": "<f8",
 }
+_WRITTEN = {1: "uchar", 4: "float", 8: "double"}
 _MAX_HEADER_LINES = 1000
 _WORLD = Frame()
 
@@ -51,14 +52,17 @@ _WORLD = Frame()
 class Ply:
     """The contents of a file.
 
-    points: [V, 3] float32. colors: [V, 3] uint8 or None. normals: [V, 3] float32 or None.
-    faces: [F, 3] int32, indices into `points`; F is 0 for a point cloud.
+    points: [V, 3] float32, float64 where the file has it so and tells from_world. colors: [V, 3]
+    uint8 or None. normals: [V, 3] float32 or None. faces: [F, 3] int32, indices into `points`; F is
+    0 for a point cloud. from_world: [3, 4], how the world of cameras.json came into these
+    coordinates; None where the file tells no such thing.
     """
 
-    points: npt.NDArray[np.float32]
+    points: FloatArray
     colors: ByteArray | None
     normals: npt.NDArray[np.float32] | None
     faces: npt.NDArray[np.int32]
+    from_world: npt.NDArray[np.float64] | None = None
 
 
 def write_points(
@@ -104,8 +108,9 @@ def write_mesh(path: Path, mesh: TriangleMesh, frame: Frame = _WORLD) -> None:
 def read_ply(path: Path) -> Ply:
     """Read a point cloud or mesh. Raises ValueError naming what is wrong with the file."""
     with path.open("rb") as file:
-        elements = _read_header(file, path.name)
-        points: npt.NDArray[np.float32] | None = None
+        elements, comments = _read_header(file, path.name)
+        matrix = next((found for line in comments if (found := matrix_of(line)) is not None), None)
+        points: FloatArray | None = None
         colors: ByteArray | None = None
         normals: npt.NDArray[np.float32] | None = None
         faces = np.zeros((0, 3), np.int32)
@@ -115,14 +120,15 @@ def read_ply(path: Path) -> Ply:
                 continue
             records = _read_records(file, element, path.name)
             if element.name == "vertex":
-                points = _columns(records, ("x", "y", "z"), np.float32)
+                exact = matrix is not None and records.dtype["x"] == np.float64
+                points = _columns(records, ("x", "y", "z"), np.float64 if exact else np.float32)
                 colors = _columns(records, ("red", "green", "blue"), np.uint8)
                 normals = _columns(records, ("nx", "ny", "nz"), np.float32)
     if points is None:
         raise ValueError(f"{path.name}: no vertex positions")
     if faces.size and (faces.min() < 0 or faces.max() >= len(points)):
         raise ValueError(f"{path.name}: a face names a vertex that does not exist")
-    return Ply(points=points, colors=colors, normals=normals, faces=faces)
+    return Ply(points, colors, normals, faces, from_world=matrix)
 
 
 def _vertex_records(
@@ -131,8 +137,10 @@ def _vertex_records(
     """The vertices as packed records, checked."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points must be [V, 3], not {list(points.shape)}")
-    fields: list[tuple[str, str]] = [(name, "<f4") for name in ("x", "y", "z")]
-    parts: list[npt.NDArray[Any]] = [frame.of_world(points.astype(np.float64, copy=False))]
+    places = frame.of_world(points.astype(np.float64, copy=False))
+    exact = "<f8" if is_far(places) else "<f4"
+    fields: list[tuple[str, str]] = [(name, exact) for name in ("x", "y", "z")]
+    parts: list[npt.NDArray[Any]] = [places]
     if normals is not None:
         if normals.shape != points.shape:
             raise ValueError(f"normals are {list(normals.shape)}, points {list(points.shape)}")
@@ -152,11 +160,11 @@ def _vertex_records(
 
 def _header(vertices: npt.NDArray[np.void], num_faces: int | None, frame: Frame) -> bytes:
     """The text before the records; without faces where `num_faces` is None."""
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {frame.note()}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {line}" for line in frame.lines()]
     lines.append(f"element vertex {len(vertices)}")
     for name in vertices.dtype.names or ():
-        kind = "uchar" if vertices.dtype[name].itemsize == 1 else "float"
-        lines.append(f"property {kind} {name}")
+        lines.append(f"property {_WRITTEN[vertices.dtype[name].itemsize]} {name}")
     if num_faces is not None:
         lines += [f"element face {num_faces}", "property list uchar int vertex_indices"]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
@@ -178,16 +186,20 @@ class _Element:
     properties: list[_Property]
 
 
-def _read_header(file: BinaryIO, name: str) -> list[_Element]:
-    """Read up to and with end_header. Raises ValueError for what is no binary PLY."""
+def _read_header(file: BinaryIO, name: str) -> tuple[list[_Element], list[str]]:
+    """Read up to and with end_header: elements and comments.
+
+    Raises ValueError for what is no binary PLY.
+    """
     if file.readline().strip() != b"ply":
         raise ValueError(f"{name}: not a PLY file")
     elements: list[_Element] = []
+    comments: list[str] = []
     for _ in range(_MAX_HEADER_LINES):
         words = file.readline(4096).decode("ascii", "replace").split()
         match words:
             case ["end_header"]:
-                return elements
+                return elements, comments
             case ["format", encoding, *_]:
                 if encoding != "binary_little_endian":
                     raise ValueError(f"{name}: {encoding} is not read, only binary_little_endian")
@@ -199,8 +211,8 @@ def _read_header(file: BinaryIO, name: str) -> list[_Element]:
                 )
             case ["property", kind, prop] if elements:
                 elements[-1].properties.append(_Property(prop, _scalar(kind, name)))
-            case ["comment" | "obj_info", *_]:
-                pass
+            case ["comment" | "obj_info", *said]:
+                comments.append(" ".join(said))
             case _:
                 raise ValueError(f"{name}: bad header line {' '.join(words)!r}")
     raise ValueError(f"{name}: the header does not end")

@@ -1,7 +1,8 @@
 """`transforms.json` in nerfstudio's layout: the cameras for other programs, and for ours again.
 
 `transform_matrix` is world_from_camera, 4x4, OpenGL axes, in the world of `cameras.json`: +Z up
-already, so `orientation_override` is "none". Pixel coordinates are the same too: the centre of the
+already, so `orientation_override` is "none". In another frame (`from_world` says how that world
+came there) it is so only where +Z is up. Pixel coordinates are the same too: the centre of the
 top-left pixel is (0.5, 0.5). Paths are those of `cameras.json`, relative to the folder that holds
 `images/`, `masks/` and `depth/`. Where the capture's own file had been moved into its world
 (`applied_transform`, `applied_scale`), both are passed on.
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.errors import ExportError
+from pipelines.exports.frame import FROM_WORLD, Frame
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 
 _PERSPECTIVE = ("PINHOLE", "OPENCV")
@@ -23,17 +25,22 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _METRIC = "metric"
 """A word of our own, which other readers pass over: the world's unit is the metre."""
 _PASSED_ON = ("applied_transform", "applied_scale")
+_WORLD = Frame()
 
 
-def write_transforms(path: Path, cameras: CamerasFile) -> None:
+def write_transforms(path: Path, cameras: CamerasFile, frame: Frame = _WORLD) -> None:
     """Write the file. Raises ExportError where the lenses cannot stand in one such file."""
-    path.write_text(transforms_text(cameras), "utf-8")
+    path.write_text(transforms_text(cameras, frame=frame), "utf-8")
 
 
 def transforms_text(
-    cameras: CamerasFile, *, depth_unit: float | None = None, points: str | None = None
+    cameras: CamerasFile,
+    *,
+    depth_unit: float | None = None,
+    points: str | None = None,
+    frame: Frame = _WORLD,
 ) -> str:
-    """The content of the file.
+    """The content of the file. frame: that in which the cameras lie.
 
     depth_unit: world units a count of the 16-bit PNGs that the images' `depth` then names; None
     where there are none. points: path of a point cloud in the same world, or None.
@@ -41,9 +48,11 @@ def transforms_text(
     """
     images = cameras.images
     lenses = [cameras.cameras[image.camera] for image in images]
+    matrix = frame.matrix()
     content: dict[str, Any] = {
         "camera_model": _camera_model(lenses),
-        "orientation_override": "none",
+        **({"orientation_override": "none"} if frame.is_upright() else {}),
+        **({} if matrix is None else {FROM_WORLD: matrix.tolist()}),
         **({_METRIC: True} if cameras.metric else {}),
         **{name: cameras.notes[name] for name in _PASSED_ON if name in cameras.notes},
     }

@@ -19,7 +19,7 @@ import numpy as np
 
 from pipelines.exports.formats.archive import entry
 from pipelines.exports.formats.glb import jpeg, linear_from_srgb
-from pipelines.exports.frame import Frame
+from pipelines.exports.frame import Frame, is_far
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 
 _SCENE, _TEXTURE = "mesh.usdc", "textures/mesh.jpg"
@@ -30,11 +30,11 @@ _PADDING_ID = 0x1986
 """Of the extra field that fills up to the next multiple; readers skip it."""
 
 
-def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, metric: bool = False) -> None:
-    """Write a mesh of the world, +Z up. metric: whether a unit is a metre."""
+def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, frame: Frame = Frame()) -> None:
+    """Write a mesh. frame: where it lies; the file has +Y up."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".usd-") as folder:
         scene = Path(folder) / _SCENE
-        _write_scene(scene, mesh, Frame("y", metric))
+        _write_scene(scene, mesh, frame.y_up())
         files = {_SCENE: scene.read_bytes()}
     if isinstance(mesh, TexturedMesh):
         files[_TEXTURE] = jpeg(mesh.texture)
@@ -53,16 +53,21 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh, metric: bool = Fal
 def _write_scene(path: Path, mesh: TriangleMesh | TexturedMesh, frame: Frame) -> None:
     """The binary USD file."""
     # Large, and few jobs want it.
-    from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.GetRootLayer().comment = f"nerfworks: {frame.note()}"
+    stage.GetRootLayer().comment = "nerfworks: " + "; ".join(frame.lines())
     root = UsdGeom.Xform.Define(stage, "/scene")
     stage.SetDefaultPrim(root.GetPrim())
     made = UsdGeom.Mesh.Define(stage, "/scene/mesh")
-    positions = frame.of_world(mesh.vertices).astype(np.float32)
+    places = frame.of_world(mesh.vertices)
+    if is_far(places):
+        middle = np.round(places.mean(axis=0))
+        places = places - middle
+        root.AddTranslateOp().Set(Gf.Vec3d(*middle.tolist()))
+    positions = places.astype(np.float32)
     made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(positions))
     made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
     made.CreateFaceVertexIndicesAttr(

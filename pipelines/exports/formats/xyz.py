@@ -23,7 +23,7 @@ def write_points(
 ) -> None:
     """Write a cloud of the world. points, normals: [P, 3]. colors: [P, 3], sRGB."""
     with path.open("w", encoding="ascii", newline="\n") as file:
-        file.write(f"# x y z red green blue nx ny nz; {frame.note()}\n")
+        file.write(f"# x y z red green blue nx ny nz; {'; '.join(frame.lines())}\n")
         for start in range(0, len(points), _ROWS):
             part = slice(start, start + _ROWS)
             rows = np.concatenate(

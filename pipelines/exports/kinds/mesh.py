@@ -1,6 +1,7 @@
 """The mesh: rendered depth fused into triangles, in the formats asked for.
 
-All of them lie in the world of cameras.json (`pipelines.exports.frame`); GLB and USDZ have +Y up.
+All of them lie in one frame, the world of cameras.json unless another is asked for
+(`pipelines.exports.frame`); GLB and USDZ have +Y up.
 GLB, OBJ and USDZ have a texture from the training photos, PLY the field's colours on its vertices,
 STL is shape alone.
 """
@@ -122,6 +123,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.crop import crop_of, cropped, empty_crop, narrowed, surface_in
     from pipelines.exports.formats import glb
     from pipelines.exports.levels import levels_of, texture_px_of
+    from pipelines.exports.placement import placement_of
     from pipelines.exports.reduction import reduced
     from pipelines.exports.surface.refinement import refined
     from pipelines.exports.surface.shells import Shell, find_shells, fuse_shells
@@ -130,6 +132,8 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.scene.depth_views import Pinhole
     from pipelines.scene.stereo_views import stereo_view
 
+    place = placement_of(options.frame, scene.cameras)
+    frame = place.frame(options.up_axis)
     ctx.progress(0.0, "looking for the scene's bounds")
     probes = scene.probe_views(ctx.check_cancelled)
     shells = find_shells(
@@ -140,7 +144,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     )
     if not shells:
         raise _empty("no ray of the training views met a surface")
-    crop = crop_of(options.crop)
+    crop = place.crop(crop_of(options.crop))
     surface_in(crop, probes, shells[-1].bounds, "mesh")
     kept = [(narrowed(shell.bounds, crop), shell.voxel) for shell in shells]
     shells = [Shell(bounds, voxel) for bounds, voxel in kept if bounds is not None]
@@ -197,11 +201,12 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     levels = []
     for level, shape in enumerate(levels_of(mesh, options.lods), start=1):
         coarse, path = paint(shape, level), ctx.out / f"mesh-lod{level}.glb"
-        glb.write_mesh(path, coarse, scene.cameras.metric, style_of(options))
+        glb.write_mesh(path, place.mesh(coarse), frame, style_of(options))
         levels.append({"file": path.name, **_told(coarse)})
     ctx.progress(_TEXTURE_SHARE, "writing")
-    _write(mesh, skin, options, ctx, scene.cameras.metric)
+    _write(place.mesh(mesh), place.mesh(skin), options, ctx, frame)
     return {
+        "frame": place.as_dict(),
         "formats": list(options.formats),
         "num_vertices": len(mesh.vertices),
         **_told(skin),
@@ -243,18 +248,17 @@ def _write(
     skin: TriangleMesh | TexturedMesh,
     options: MeshOptions,
     ctx: StageContext,
-    metric: bool,
+    frame: Frame,
 ) -> None:
     """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
     from pipelines.exports.formats import glb, obj, ply, stl, usdz
 
-    frame = Frame(options.up_axis, metric)
     writers: dict[Format, Callable[[Path], None]] = {
-        "glb": lambda path: glb.write_mesh(path, skin, metric, style_of(options)),
+        "glb": lambda path: glb.write_mesh(path, skin, frame, style_of(options)),
         "ply": lambda path: ply.write_mesh(path, mesh, frame),
         "obj": lambda path: obj.write_mesh(path, skin, frame),
         "stl": lambda path: stl.write_mesh(path, mesh, frame),
-        "usdz": lambda path: usdz.write_mesh(path, skin, metric),
+        "usdz": lambda path: usdz.write_mesh(path, skin, frame),
     }
     for name in options.formats:
         ctx.check_cancelled()
@@ -272,7 +276,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=6,
+    version=7,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

@@ -1,9 +1,9 @@
 """The point cloud: points with colour and normals from the depth of training views.
 
-In the world frame of cameras.json, in the formats asked for. Normals point to the cameras that saw
-the points. Views are spread over the capture and just large enough for the
-points wanted, so the work is known beforehand and an empty crop ends in an error instead of a
-search without end.
+In one frame, the world of cameras.json unless another is asked for, in the formats asked for.
+Normals point to the cameras that saw the points. Views are spread over the capture and just large
+enough for the points wanted, so the work is known beforehand and an empty crop ends in an error
+instead of a search without end.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pydantic import Field, field_validator
 
 from pipelines.errors import ExportError
 from pipelines.exports.export import Export
-from pipelines.exports.frame import Frame
 from pipelines.exports.options import CropOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from pipelines.exports.placement import Placement
     from pipelines.exports.surface.cloud import Cloud
     from pipelines.scene.cameras_file import CamerasFile
     from pipelines.scene.trained_scene import TrainedScene
@@ -83,6 +83,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     # Imported where it runs: the API reads this file too.
     from pipelines.exports.crop import crop_of, empty_crop, narrowed, surface_in
     from pipelines.exports.formats.colmap import check_lenses
+    from pipelines.exports.placement import placement_of
     from pipelines.exports.spacing import one_of_each_cube
     from pipelines.exports.surface import cloud as clouds
     from pipelines.exports.surface.views import (
@@ -95,13 +96,14 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
 
     if "colmap" in options.formats:
         check_lenses(scene.cameras)
+    place = placement_of(options.frame, scene.cameras)
     ctx.progress(0.0, "looking for the scene's bounds")
     probes = scene.probe_views(ctx.check_cancelled)
     subject = scene.bounds(options.max_distance, ctx.check_cancelled, probes)
     bounds = scene.bounds(reach_of(options), ctx.check_cancelled, probes)
     if subject is None or bounds is None:
         raise _empty("no ray of the training views met a surface")
-    crop = crop_of(options.crop)
+    crop = place.crop(crop_of(options.crop))
     around = surface_in(crop, probes, bounds, "pointcloud")
     bounds = narrowed(bounds, crop) or bounds
     images = scene.training_images(_MAX_VIEWS)
@@ -134,8 +136,9 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     ctx.progress(0.92, "estimating normals")
     normals = clouds.oriented_normals(cloud, bounds.focus)
     ctx.progress(0.97, "writing")
-    _write(cloud, normals, options, ctx, scene.cameras)
+    _write(cloud, normals, options, ctx, place, scene.cameras)
     return {
+        "frame": place.as_dict(),
         "formats": list(options.formats),
         "num_points": len(cloud),
         "num_views": len(images),
@@ -148,19 +151,23 @@ def _write(
     normals: NDArray[np.float64],
     options: PointcloudOptions,
     ctx: StageContext,
+    place: Placement,
     cameras: CamerasFile,
 ) -> None:
     """The files. normals: [P, 3]."""
     from pipelines.exports.formats import las, ply, xyz
     from pipelines.exports.formats.colmap import write_colmap_points
 
-    content = (cloud.points, cloud.colors, normals, Frame(metric=cameras.metric))
+    points, cameras = place.points(cloud.points), place.cameras(cameras)
+    content = (points, cloud.colors, place.directions(normals), place.frame())
     writers: dict[Format, Callable[[Path], None]] = {
         "ply": lambda path: ply.write_points(path, *content),
         "las": lambda path: las.write_points(path, *content),
         "laz": lambda path: las.write_points(path, *content),
         "xyz": lambda path: xyz.write_points(path, *content),
-        "colmap": lambda path: write_colmap_points(path, cameras, cloud.points, cloud.colors),
+        "colmap": lambda path: write_colmap_points(
+            path, cameras, points, cloud.colors, place.frame()
+        ),
     }
     for name in options.formats:
         ctx.check_cancelled()
@@ -177,7 +184,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=4,
+    version=5,
     reads=("depth",),
     run=run,
     options=PointcloudOptions,

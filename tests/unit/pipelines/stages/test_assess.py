@@ -12,8 +12,10 @@ from PIL import Image
 
 from pipelines.errors import ExportError
 from pipelines.exports.formats import glb
-from pipelines.exports.formats.ply import write_mesh, write_points
+from pipelines.exports.formats.ply import read_ply, write_mesh, write_points
+from pipelines.exports.frame import FrameName
 from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.placement import placement_of
 from pipelines.nerf.stereo.maps import DepthMap
 from pipelines.sample.film import phone_camera
 from pipelines.sample.scene import depth_image, pixel_rays, pose_matrix, raycast
@@ -22,6 +24,7 @@ from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.sensor_depth import save_sensor_depth
 from pipelines.workspace import MANIFEST, Workspace
+from tests.unit.pipelines.exports.test_placement import MOVED
 from tests.unit.pipelines.stages import tiny_job
 
 
@@ -128,6 +131,23 @@ def test_the_mesh_is_compared_with_depth_that_views_agree_on(
         1.0, abs=1e-3
     )
     assert found["num_pixels"] > 6 * 36 * 64
+
+
+@pytest.mark.parametrize("name", ["source", "normalised"])
+def test_assets_of_another_frame_are_brought_back(job: Workspace, name: FrameName) -> None:
+    _exact_assets(job)
+    here = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    place = placement_of(name, replace(cameras, notes=MOVED))
+    mesh, cloud = job.stage("mesh") / "mesh.glb", job.stage("pointcloud") / "pointcloud.ply"
+    glb.write_mesh(mesh, place.mesh(glb.read_mesh(mesh)), place.frame())
+    read = read_ply(cloud)
+    points = place.points(read.points.astype(np.float64))
+    assert np.abs(points - read.points).max() > 0.1
+    write_points(cloud, points, read.colors, None, place.frame())
+    there = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert there["mesh"] == pytest.approx(here["mesh"], rel=1e-2)
+    assert there["cloud"] == pytest.approx(here["cloud"], rel=1e-2)
 
 
 def test_the_photos_are_the_held_out_ones(job: Workspace) -> None:

@@ -13,6 +13,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
 
 from pipelines.exports.formats import usdz
 from pipelines.exports.formats.glb import linear_from_srgb
+from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from tests.unit.pipelines.exports.formats import solids
 
@@ -25,7 +26,7 @@ def mesh(request: pytest.FixtureRequest) -> TriangleMesh | TexturedMesh:
 @pytest.fixture
 def file(tmp_path: Path, mesh: TriangleMesh | TexturedMesh) -> Path:
     path = tmp_path / "mesh.usdz"
-    usdz.write_mesh(path, mesh, metric=True)
+    usdz.write_mesh(path, mesh, Frame(metric=True))
     assert [entry.name for entry in tmp_path.iterdir()] == ["mesh.usdz"]
     return path
 

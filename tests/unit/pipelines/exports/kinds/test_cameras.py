@@ -23,7 +23,8 @@ def test_all_three_files_hold_the_corrected_poses(job: Workspace) -> None:
     summary = tiny_job.run(job, "cameras")["summary"]
     out = job.stage("cameras")
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
-    assert summary == {"num_images": 20, "num_lenses": len(cameras.cameras), "left_out": {}}
+    assert (summary["num_images"], summary["num_lenses"]) == (20, len(cameras.cameras))
+    assert summary["left_out"] == {}
     poses = np.asarray([image.world_from_camera for image in cameras.images])
     frames = json.loads((out / "transforms.json").read_text("utf-8"))["frames"]
     written = np.asarray([frame["transform_matrix"] for frame in frames])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 from pipelines.errors import ExportError
 from pipelines.exports.formats.ply import read_ply, write_points
 from pipelines.exports.kinds.dataset import EXPORT, DatasetOptions
+from pipelines.exports.placement import to_world
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.sensor_depth import load_sensor_depth, save_sensor_depth
 from pipelines.scene.trained_scene import TrainedScene
@@ -115,6 +117,29 @@ def test_a_trained_job_goes_out_and_comes_back_the_same(job: Workspace, tmp_path
     read, ctx = ingest(tmp_path / "colmap", files)
     assert read["kind"] == "colmap"
     assert_same_cameras(ctx, trained)
+
+
+def test_in_another_frame_cameras_points_and_depth_lie_in_one_place(
+    job: Workspace, tmp_path: Path
+) -> None:
+    cameras = enriched(job)
+    _, here = exported(job, cameras)
+    shutil.rmtree(job.partial("dataset"))
+    summary, there = exported(job, cameras, frame="normalised")
+    scale = np.linalg.norm(np.array(summary["frame"]["from_world"])[0, :3])
+    assert abs(scale - 1.0) > 0.01, "or this test would see nothing"
+    before, after = (json.loads(files["transforms.json"]) for files in (here, there))
+    ratio = after["depth_unit_scale_factor"] / before["depth_unit_scale_factor"]
+    assert ratio == pytest.approx(scale)
+    centers = [
+        np.array([frame["transform_matrix"] for frame in one["frames"]])[:, :3, 3]
+        for one in (before, after)
+    ]
+    np.testing.assert_allclose(to_world(centers[1], summary), centers[0], atol=1e-9)
+    (tmp_path / "points.ply").write_bytes(there["sparse_pc.ply"])
+    points = read_ply(tmp_path / "points.ply").points
+    np.testing.assert_allclose(to_world(points, summary), POINTS, atol=1e-5)
+    assert {name for name in there if "depth" in name} == {name for name in here if "depth" in name}
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])
