@@ -70,6 +70,11 @@ class MeshOptions(CropOptions, TextureOptions):
         description="photos moves the fused surface onto what the training photos agree on, a "
         "fraction of a voxel, and leaves out what no two of them show; none leaves it as fused.",
     )
+    flatten: bool = Field(
+        True,
+        description="Floors, walls and table tops become plane where they are so but for bumps of "
+        "a voxel or two, and as far as the photos do not say otherwise. Part of refine=photos.",
+    )
     max_faces: int = Field(
         200_000,
         ge=100,
@@ -176,6 +181,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             lambda done: ctx.progress(
                 _FUSE_SHARE + (_REFINE_SHARE - _FUSE_SHARE) * done, "refining", None
             ),
+            flat=options.flatten,
         )
         del photos
     whole, mesh = mesh, cropped(mesh, crop)

@@ -9,7 +9,9 @@ are believed by how clear they are and by how well they fit the neighbours': the
 
 with t the trust, less where an answer is far from the solution, and s falling from 16 to 1/2: first
 whole regions move, then details. Where photos say nothing, vertices go with their neighbours.
-Vertices on sharp edges and open borders stay: there a patch on the tangent shows two things.
+Vertices on sharp edges and open borders stay: there a patch on the tangent shows two things. What
+is about plane is made so before, as a wall whose normals tremble looks sharp all over, and once
+more in the end, as far as the photos do not say otherwise (`pipelines.exports.surface.flatness`).
 """
 
 from __future__ import annotations
@@ -20,10 +22,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import diags_array
 from scipy.sparse.linalg import cg
 
 from pipelines.exports.mesh import TriangleMesh, unit_normals
+from pipelines.exports.surface.flatness import find_flat_parts, flattened
+from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
 from pipelines.nerf.stereo.refinement import Offsets, Pictures, photo_offsets
 from pipelines.nerf.stereo.views import StereoView
@@ -49,20 +53,24 @@ def refined(
     mesh: TriangleMesh,
     views: Sequence[StereoView],
     on_progress: Callable[[float], None] = lambda done: None,
+    *,
+    flat: bool = True,
 ) -> TriangleMesh:
     """The mesh with its vertices moved and without what no two views show.
 
-    Colours stay. views: undistorted grey photos with their cameras, in the mesh's world.
-    on_progress: told the share that is done; may raise.
+    Colours stay. views: undistorted grey photos with their cameras, in the mesh's world. flat:
+    whether what is about plane becomes plane. on_progress: told the share that is done; may raise.
     """
     if len(mesh.faces) == 0 or not views:
         return mesh
     origin = mesh.vertices.mean(axis=0)
     vertices = mesh.vertices - origin
-    around = _neighbours(mesh.faces, len(vertices))
-    sharp = _sharpness(vertices, mesh.faces, around)
+    rings = MeshRings(mesh.faces, len(vertices))
+    if flat:
+        vertices = flattened(vertices, find_flat_parts(vertices, rings), rings)
+    sharp = _sharpness(vertices, rings)
     for index, (factor, num_steps) in enumerate(_ROUNDS):
-        normals = vertex_normals(vertices, mesh.faces)
+        normals = rings.normals(vertices)
 
         def on_view(done: float, before: int = index) -> None:
             on_progress((before + _SIGHT_SHARE * done) / len(_ROUNDS))
@@ -71,18 +79,22 @@ def refined(
             on_progress((before + _SIGHT_SHARE + _POINTS_SHARE * done) / len(_ROUNDS))
 
         seen = _seen(vertices, normals, mesh.faces, views, origin, on_view)
-        smooth = _smoothed(normals, around)
+        smooth = _smoothed(normals, rings)
         pictures = Pictures.of([view.reduced(factor) for view in views], origin)
         offsets = photo_offsets(vertices, smooth, seen, pictures, num_steps, on_progress=on_point)
-        moves = _agreed(offsets, around, _edge_lengths(vertices, around), sharp)
+        moves = _agreed(offsets, rings, rings.edge_lengths(vertices), sharp)
         vertices = vertices + moves[:, None] * smooth
         on_progress((index + 1) / len(_ROUNDS))
-    moved = replace(mesh, vertices=vertices + origin, normals=vertex_normals(vertices, mesh.faces))
-    return moved.with_faces(_shown_faces(mesh.faces, seen, around))
+    if flat:
+        answers = offsets.length.astype(np.float64) - moves
+        parts = find_flat_parts(vertices, rings)
+        vertices = flattened(vertices, parts, rings, answers, offsets.trust.astype(np.float64))
+    moved = replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
+    return moved.with_faces(_shown_faces(mesh.faces, seen, rings))
 
 
 def _shown_faces(
-    faces: NDArray[np.int32], seen: NDArray[np.uint8], around: csr_array
+    faces: NDArray[np.int32], seen: NDArray[np.uint8], rings: MeshRings
 ) -> NDArray[np.int32]:
     """The faces that have a corner which enough views show, or which is next to one that they do.
 
@@ -90,47 +102,15 @@ def _shown_faces(
     half of it is wrong. A mesh of which nothing is shown stays.
     """
     shown = (seen.sum(axis=0, dtype=np.int32) >= _LEAST_VIEWS).astype(np.float64)
-    near = (shown + around @ shown) > 0.0
+    near = (shown + rings.around @ shown) > 0.0
     kept = near[faces].any(axis=1)
     return faces[kept] if kept.any() else faces
 
 
-def vertex_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
-    """[V, 3], unit: the mean of the faces around each, by area."""
-    across = np.cross(
-        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
-    )
-    total = np.zeros_like(vertices)
-    for corner in range(3):
-        for axis in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], across[:, axis], len(vertices))
-    return unit_normals(total)
-
-
-def _neighbours(faces: NDArray[np.int32], count: int) -> csr_array:
-    """[V, V]: 1 where an edge is."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
-    found = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
-    found.data[:] = 1.0
-    return found
-
-
-def _edge_lengths(vertices: Floats, around: csr_array) -> Floats:
-    """[V]: the mean length of the edges at each vertex."""
-    pairs = around.tocoo()
-    length = np.linalg.norm(vertices[pairs.row] - vertices[pairs.col], axis=1)
-    count = np.bincount(pairs.row, minlength=len(vertices))
-    total = np.bincount(pairs.row, length, len(vertices))
-    mean: Floats = total / np.maximum(count, 1)
-    return mean
-
-
-def _smoothed(normals: Floats, around: csr_array) -> Floats:
+def _smoothed(normals: Floats, rings: MeshRings) -> Floats:
     """Normals with their neighbours' mean: a fused surface's own are noisy."""
-    count = np.maximum(np.asarray(around.sum(axis=1)).ravel(), 1.0)[:, None]
     for _ in range(_NORMAL_ROUNDS):
-        normals = unit_normals(normals + (around @ normals) / count)
+        normals = unit_normals(rings.spread(normals, 1))
     return normals
 
 
@@ -157,27 +137,18 @@ def _seen(
     return seen
 
 
-def _sharpness(vertices: Floats, faces: NDArray[np.int32], around: csr_array) -> Floats:
+def _sharpness(vertices: Floats, rings: MeshRings) -> Floats:
     """[V] in [0, 1]: 0 where the surface is about flat, 1 at its edges and open borders."""
-    across = np.cross(
-        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
-    )
-    total, area = np.zeros_like(vertices), np.zeros(len(vertices))
-    for corner in range(3):
-        area += np.bincount(faces[:, corner], np.linalg.norm(across, axis=1), len(vertices))
-        for axis in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], across[:, axis], len(vertices))
+    total, area = rings.crossed(vertices)
     for _ in range(_NORMAL_ROUNDS):
-        total, area = total + around @ total, area + around @ area
+        total, area = total + rings.around @ total, area + rings.around @ area
     straight = np.linalg.norm(total, axis=1) / np.maximum(area, 1e-30)
     sharp: Floats = np.clip((_STRAIGHT - straight) / (_STRAIGHT - _BENT), 0.0, 1.0)
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    pairs, counts = np.unique(edges, axis=0, return_counts=True)
-    sharp[pairs[counts == 1]] = 1.0
+    sharp[rings.on_border] = 1.0
     return sharp
 
 
-def _agreed(offsets: Offsets, around: csr_array, lengths: Floats, sharp: Floats) -> Floats:
+def _agreed(offsets: Offsets, rings: MeshRings, lengths: Floats, sharp: Floats) -> Floats:
     """The moves [V] that fit those offsets that are believed, and each other."""
     wanted, trust = offsets.length.astype(np.float64), offsets.trust * (1.0 - sharp)
     hold = _HOLD + _HOLD_SHARP * sharp
@@ -186,8 +157,7 @@ def _agreed(offsets: Offsets, around: csr_array, lengths: Floats, sharp: Floats)
         return np.zeros(len(wanted))
     in_edges = np.abs(wanted[clear]) / lengths[clear]
     typical = float(np.median(in_edges)) * lengths + 1e-30
-    degree = np.asarray(around.sum(axis=1)).ravel()
-    stiff: Any = diags_array(degree) - around
+    stiff: Any = rings.laplacian
     weights, found = trust, np.zeros(len(wanted))
     for stiffness in _STIFFNESS:
         matrix = (diags_array(weights + hold) + stiffness * stiff).tocsr()
