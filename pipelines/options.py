@@ -103,7 +103,8 @@ class PosesOptions(StageOptions):
         "auto",
         description="Lens model that is fitted. auto starts with SIMPLE_RADIAL (square pixels, one "
         "radial term) and goes to RADIAL or OPENCV where that lowers the error of observations "
-        "that were set aside; OPENCV_FISHEYE must be asked for.",
+        "that were set aside; OPENCV_FISHEYE where the matches of a film fit no plain lens, while "
+        "photos of a fisheye must be called so here.",
     )
     min_registered_ratio: float = Field(
         0.3, ge=0, le=1, description="Below this share of registered images the job fails."

@@ -17,7 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipelines.options import PosesOptions
-from pipelines.sfm.intrinsics import mapping_lens
+from pipelines.scene.panoramas import MODEL as PANORAMA
+from pipelines.sfm.intrinsics import AUTO, FISHEYE, mapping_lens
 from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
 from pipelines.sfm.report import Attempt, Outcome, check_features
 from pipelines.sfm.retrieval import (
@@ -30,6 +31,7 @@ from pipelines.sfm.retrieval import (
 from pipelines.sfm.rungs import MAX_ALL_PAIRS, RUNGS, Matches, Rung, Standing
 from pipelines.sfm.source import Source, camera_groups
 from pipelines.sfm.turning import is_turning
+from pipelines.sfm.wide_lenses import probing_pairs, recognised
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import (
     FeatureSettings,
@@ -47,7 +49,7 @@ ENOUGH_FEATURES = 500
 PANORAMA_FACTOR = 2
 """Panoramas are looked at so many times as large as other images, for so many more features."""
 
-_FORMAT = 4
+_FORMAT = 5
 """Of the checkpoint: raised where the same options give other databases or names of steps."""
 
 Span = tuple[float, float]
@@ -188,6 +190,7 @@ class Ladder:
             self._statistics = self._reconstructor.statistics()
             if not self._attempts:
                 check_features(self._statistics, self._options)
+            self._recognise_fisheyes(rung.matches, matcher)
             self._match(rung.matches, matcher, (found, matched))
             self._statistics = self._reconstructor.statistics()
             if not self._attempts and is_turning(self._statistics):
@@ -255,6 +258,42 @@ class Ladder:
     def _vectors(self) -> Floats:
         """What each image looks like."""
         return image_vectors(self._reconstructor.features(FEATURES_PER_IMAGE), self._ctx.seed)
+
+    def _recognise_fisheyes(self, wanted: Matches, matcher: str) -> None:
+        """Give the fisheyes among the cameras their lens, and a focal length to start from.
+
+        A film without any, which is quickly told, saves nothing for it.
+        """
+        asked_for = self._options.camera_model == FISHEYE
+        step = f"{wanted.database} lenses"
+        of_film = self._source.is_video and self._options.camera_model == AUTO
+        is_known = any(map(self._checkpoint.has, (step, f"{wanted.database} {matcher}")))
+        if not (asked_for or of_film) or is_known:
+            return
+        num_found = 0
+        for group in camera_groups(self._source, mapping_lens(self._options.camera_model)):
+            pairs = probing_pairs(group.indices)
+            if group.lens == PANORAMA or group.focal_px is not None or not pairs:
+                continue
+            self._ctx.progress(self._progress.fraction, "looking at the lens")
+            self._reconstructor.match(
+                pairs, lambda _: self._ctx.check_cancelled(), thorough=wanted.thorough
+            )
+            found = recognised(self._reconstructor.matched(pairs), asked_for=asked_for)
+            if found is not None:
+                num_found += 1
+                self._ctx.logger.info(
+                    "images %d to %d: a fisheye of about %.0f degrees, which %d matches fit (a "
+                    "plain lens: %d)",
+                    group.indices[0],
+                    group.indices[-1],
+                    found.angle_deg,
+                    found.num_fitting,
+                    found.num_plain,
+                )
+                self._reconstructor.set_lens(group.indices, FISHEYE, found.focal_px)
+        if num_found:
+            self._checkpoint.save(step)
 
     def _match(self, wanted: Matches, matcher: str, span: Span) -> None:
         step = f"{wanted.database} {matcher}"

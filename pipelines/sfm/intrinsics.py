@@ -37,9 +37,10 @@ from pipelines.tools.colmap_results import SparseModel
 Floats = npt.NDArray[np.float64]
 
 AUTO = "auto"
+FISHEYE = "OPENCV_FISHEYE"
 LENSES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """Tried in this order; each must earn its place over the best before it. OPENCV is the first with
-two focal lengths; OPENCV_FISHEYE is another kind of lens, and fitted only where it is asked for."""
+two focal lengths. A fisheye is another kind of lens, and known before mapping."""
 MIN_GAIN = 0.005
 BENT_GAIN = 0.02
 MAX_MOVE = 0.01
@@ -158,7 +159,11 @@ def settle_lenses(
     fits = [trials.fit(trials.cameras)]
     if wanted == AUTO:
         for lens in LENSES[1:]:
-            changed = {i: lens for i, views in trials.num_views.items() if views >= MIN_VIEWS}
+            changed = {
+                i: lens
+                for i, views in trials.num_views.items()
+                if views >= MIN_VIEWS and trials.cameras[i] != FISHEYE
+            }
             if changed:
                 fits.append(trials.fit(trials.cameras | changed))
     best = _best_fit(fits, trials)
@@ -301,6 +306,8 @@ def _why(wanted: str, candidates: Sequence[Candidate], lens: str, num_held_out: 
     """Why this lens, in words."""
     if wanted != AUTO:
         return "asked for"
+    if lens == FISHEYE:
+        return "matches fit a fisheye, and no plain lens"
     if num_held_out < MIN_HELD_OUT:
         return "too few points are seen by four images to compare lenses"
     if len(candidates) == 1:

@@ -32,6 +32,7 @@ from PIL import Image
 
 from pipelines.errors import ToolError
 from pipelines.tools.colmap_lenses import LensTrials
+from pipelines.tools.colmap_probing import MatchedPairs, set_lens
 from pipelines.tools.colmap_results import (
     PairStatistics,
     SparseModel,
@@ -293,6 +294,17 @@ class Reconstructor:
             seed=self.seed,
             run=lambda what, call: self._run(what, call, poll),
         )
+
+    def matched(self, pairs: Sequence[tuple[int, int]]) -> MatchedPairs:
+        """Matches of pairs that were matched, to compare lenses by. Not while a call runs."""
+        return MatchedPairs(self.database, self.names, pairs, self.seed)
+
+    def set_lens(self, indices: Sequence[int], lens: str, focal_px: float) -> None:
+        """Give images of one camera another lens, of known focal length. Not while a call runs.
+
+        Their pairs must be matched again, which only verifies what was matched before.
+        """
+        set_lens(self.database, self.names, indices, lens, focal_px)
 
     def statistics(self) -> PairStatistics:
         """What extraction and matching put into the database. Not while another call runs."""

@@ -13,15 +13,17 @@ from typing import Any
 
 import numpy as np
 import PIL.Image
+import pytest
 
 from pipelines.options import FramesOptions, IngestOptions, PosesOptions
 from pipelines.sample.align import path_extent, similarity
+from pipelines.sample.film import hand_held_pose
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.panoramas import view_side, world_from_views
 from pipelines.stage import StageContext
 from pipelines.stages import frames, ingest, poses
 from pipelines.workspace import Workspace
-from tests.lens_films import film, level_pose, panorama_camera, walked
+from tests.lens_films import film, fisheye_camera, level_pose, panorama_camera, walked
 from tests.unit.pipelines.tools.clips import spherical
 
 AXES = np.diag([1.0, -1.0, -1.0])
@@ -83,6 +85,28 @@ def test_a_film_of_the_whole_sphere_becomes_views_with_true_poses(tmp_path: Path
         true += [np.column_stack([v[:, :3] @ AXES, v[:, 3]]) for v in world_from_views(opencv, 4)]
     rotation_deg, center = errors(
         np.array([image.world_from_camera for image in cameras.images]), np.array(true)
+    )
+    assert rotation_deg < 0.2
+    assert center < 0.005
+
+
+def test_a_fisheyes_film_is_recognised_and_its_lens_found(tmp_path: Path) -> None:
+    """150 degrees across, bent off the equidistant rule; nobody says that it is a fisheye."""
+    camera = fisheye_camera(480, 360, 150.0)
+    truth = walked(camera, 14, hand_held_pose)
+    uploaded(tmp_path / "job", film(tmp_path / "a.mp4", truth, side=1))
+    run(tmp_path / "job", "ingest", IngestOptions())
+    run(tmp_path / "job", "frames", FramesOptions(num_frames=14))
+    found = run(tmp_path / "job", "poses", PosesOptions(max_image_px=480, num_features=1500))
+    assert found["num_registered"] == found["num_images"] == 14
+    assert found["intrinsics"]["model"] == "OPENCV_FISHEYE"
+    assert "fisheye" in found["intrinsics"]["why"]
+    cameras = CamerasFile.load(tmp_path / "job" / "poses" / "cameras.json")
+    (lens,) = cameras.cameras
+    assert lens.model == "OPENCV_FISHEYE"
+    assert lens.fl_x == pytest.approx(camera.fl_x, rel=0.01)
+    rotation_deg, center = errors(
+        *(np.array([i.world_from_camera for i in c.images]) for c in (cameras, truth))
     )
     assert rotation_deg < 0.2
     assert center < 0.005
