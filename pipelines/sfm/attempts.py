@@ -18,6 +18,7 @@ from pathlib import Path
 
 from pipelines.options import PosesOptions
 from pipelines.scene.panoramas import MODEL as PANORAMA
+from pipelines.sfm.agreement import MOST_MATCHES, MOST_PAIRS, agreement_of_model
 from pipelines.sfm.intrinsics import AUTO, FISHEYE, mapping_lens
 from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
 from pipelines.sfm.report import Attempt, Outcome, check_features
@@ -199,8 +200,13 @@ class Ladder:
         return self.outcome
 
     def _standing(self) -> Standing:
-        most = max((attempt.num_registered for attempt in self._attempts), default=0)
-        return Standing(len(self._source.files), most, self._options.retry_below_ratio)
+        best = self.outcome.chosen
+        return Standing(
+            len(self._source.files),
+            best.num_registered,
+            self._options.retry_below_ratio,
+            is_contradicted=best.is_contradicted,
+        )
 
     def _matcher(self, wanted: Matches) -> str:
         """How this rung's pairs are chosen: sequential, exhaustive or retrieval."""
@@ -310,15 +316,19 @@ class Ladder:
         num = len(self._source.files)
         settings = replace(rung.mapper, refine_principal_point=self._options.refine_principal_point)
         models = self._reconstructor.map(settings, self._progress.watch(span, num, "placing image"))
+        seen = self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES)
+        models = [replace(model, agreement=agreement_of_model(model, seen)) for model in models]
         attempt = Attempt(rung, matcher, tuple(models), time.monotonic() - began)
         self._attempts.append(attempt)
         self._ctx.logger.info(
-            "%s attempt, %s matching: %d of %d images registered, models of %s",
+            "%s attempt, %s matching: %d of %d images registered, models of %s that agree with %s "
+            "of the matches",
             rung.name,
             matcher,
             attempt.num_registered,
             num,
             [len(model.indices) for model in models],
+            [None if model.agreement is None else round(model.agreement, 3) for model in models],
         )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from pipelines.errors import PipelineError, PosesError
 from pipelines.options import PosesOptions
 from pipelines.scene.orientation import normalise, opengl_from_opencv
+from pipelines.sfm.agreement import LITTLE
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings
 from pipelines.sfm.rungs import RUNGS, Rung
 from pipelines.sfm.source import Source
@@ -53,8 +54,19 @@ class Attempt:
 
     @property
     def best(self) -> SparseModel | None:
-        """The model with most images."""
+        """The model that holds most images, as far as matches do not contradict it."""
         return best_model(self.models)
+
+    @property
+    def weight(self) -> float:
+        """What the best model counts against those of other attempts."""
+        return 0.0 if self.best is None else self.best.weight
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether most of what pictures show speaks against the best model."""
+        found = None if self.best is None else self.best.agreement
+        return found is not None and found < LITTLE
 
     @property
     def num_registered(self) -> int:
@@ -71,9 +83,12 @@ class Outcome:
 
     @property
     def chosen(self) -> Attempt:
-        """The attempt that placed most images, the earliest among equals; empty without any."""
+        """The attempt that placed most images of those that are believed as much as the best, or
+        nearly, the earliest among equals; empty without any."""
         nothing = Attempt(RUNGS[0], matcher="", models=(), seconds=0.0)
-        return max(self.attempts, key=lambda attempt: attempt.num_registered, default=nothing)
+        most = max((attempt.weight for attempt in self.attempts), default=0.0)
+        believed = [one for one in self.attempts if one.weight >= 0.98 * most]
+        return max(believed, key=lambda attempt: attempt.num_registered, default=nothing)
 
 
 def num_needed(num_images: int, options: PosesOptions) -> int:
@@ -212,6 +227,7 @@ def build_report(outcome: Outcome, source: Source) -> dict[str, Any]:
             {
                 "num_images": len(found.indices),
                 "num_points": len(found.points),
+                "agreement": None if found.agreement is None else round(found.agreement, 4),
                 "chosen": found is chosen.best,
             }
             for found in chosen.models
@@ -251,15 +267,32 @@ def report_of_model(
     return {
         "mean_reprojection_error_px": model.error_px,
         "median_triangulation_angle_deg": model.angle_deg,
+        "agreement": None if model.agreement is None else round(model.agreement, 4),
         "num_points": len(model.points),
         "num_cameras": len(model.cameras),
         "intrinsics": {
             **lenses[0].as_dict(),
             "other_cameras": [found.as_dict() for found in lenses[1:]],
         },
-        "warnings": lens_warnings(lenses),
+        "warnings": [*lens_warnings(lenses), *doubts_of(model)],
         "world": world,
     }
+
+
+def doubts_of(model: SparseModel) -> list[dict[str, Any]]:
+    """What is to be told of a model that matches contradict."""
+    if model.agreement is None or model.agreement >= LITTLE:
+        return []
+    return [
+        {
+            "code": "poses_contradicted",
+            "message": f"The poses agree with only {model.agreement:.0%} of what neighbouring "
+            "pictures show: parts of the scene may be bent or doubled.",
+            "hint": "Avoid mirrors and things that look the same from several sides, or film more "
+            "of what stands around them.",
+            "details": {"agreement": round(model.agreement, 4)},
+        }
+    ]
 
 
 def report_of_failure(

@@ -33,11 +33,13 @@ class Matches:
 
 @dataclass(frozen=True)
 class Standing:
-    """How far the climb has come. num_registered: of the best attempt so far, 0 before any."""
+    """How far the climb has come. num_registered: of the best attempt so far, 0 before any.
+    is_contradicted: whether matches contradict that one's model."""
 
     num_images: int
     num_registered: int
     wanted_ratio: float
+    is_contradicted: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,11 @@ def always(standing: Standing) -> bool:
 
 
 def too_few_registered(standing: Standing) -> bool:
-    """Where no attempt so far has registered the wanted share of images."""
-    return standing.num_registered < standing.wanted_ratio * standing.num_images
+    """Where no attempt so far has registered the wanted share of images, or not believably."""
+    return (
+        standing.is_contradicted
+        or standing.num_registered < standing.wanted_ratio * standing.num_images
+    )
 
 
 _PLANNED = Matches("colmap")

@@ -43,6 +43,7 @@ _SUMMARY = (
     "metric",
     "mean_reprojection_error_px",
     "median_triangulation_angle_deg",
+    "agreement",
     "num_points",
     "num_cameras",
     "intrinsics",

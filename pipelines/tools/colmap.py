@@ -36,7 +36,9 @@ from pipelines.tools.colmap_probing import MatchedPairs, set_lens
 from pipelines.tools.colmap_results import (
     PairStatistics,
     SparseModel,
+    VerifiedMatches,
     read_features,
+    read_matches,
     read_statistics,
     sparse_model,
 )
@@ -309,6 +311,10 @@ class Reconstructor:
     def statistics(self) -> PairStatistics:
         """What extraction and matching put into the database. Not while another call runs."""
         return read_statistics(self.database, len(self.names))
+
+    def verified(self, most_pairs: int, most_matches: int) -> VerifiedMatches:
+        """Verified matches of some pairs, see `read_matches`. Not while another call runs."""
+        return read_matches(self.database, len(self.names), most_pairs, most_matches)
 
     def features(self, per_image: int) -> list[npt.NDArray[np.uint8]]:
         """Descriptors of every image, [at most per_image, 128]. Not while another call runs."""

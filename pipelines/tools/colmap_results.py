@@ -33,6 +33,10 @@ _ONE_HOMOGRAPHY = (
 )
 
 
+VerifiedMatches = dict[tuple[int, int], tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]
+"""By pairs of indices: places in pixels in the one and the other, [M, 2] each."""
+
+
 @dataclass(frozen=True)
 class PairStatistics:
     """What matching found.
@@ -63,6 +67,8 @@ class SparseModel:
     indices: [N], the images it holds, ascending. cameras: lenses in use.
     camera_of: [N], index into `cameras`. world_from_camera: [N, 3, 4] float64, OpenCV axes.
     points: [P, 3] float64. colors: [P, 3] uint8. track_lengths: [P], images that see each point.
+    agreement: the share of verified matches that its poses can be right about
+    (`pipelines.sfm.agreement`), None where nobody looked or too few pairs tell.
     error_px: mean reprojection error. angle_deg: median over points of the widest angle between
     two of its rays; small where the camera hardly moved. stored: the folder it was written to.
     """
@@ -77,14 +83,21 @@ class SparseModel:
     error_px: float
     angle_deg: float
     stored: Path | None = None
+    agreement: float | None = None
+
+    @property
+    def weight(self) -> float:
+        """What it counts against others: images, less where matches contradict it."""
+        return len(self.indices) * (1.0 if self.agreement is None else self.agreement)
 
 
 def best_model(models: Sequence[SparseModel]) -> SparseModel | None:
-    """The model with most images, then most points; None where there is none.
+    """The model of most weight, then most points; None where there is none.
 
-    COLMAP's first model is often a spurious one of a few images: its order says nothing.
+    COLMAP's first model is often a spurious one of a few images: its order says nothing. Nor does
+    the number of images alone, or the reprojection error: a twisted model may have the best.
     """
-    return max(models, key=lambda model: (len(model.indices), len(model.points)), default=None)
+    return max(models, key=lambda model: (model.weight, len(model.points)), default=None)
 
 
 def intrinsics_from_colmap(
@@ -159,9 +172,11 @@ def read_features(database: Path, num_images: int, per_image: int) -> list[npt.N
 
 
 def read_matches(
-    database: Path, num_images: int
-) -> dict[tuple[int, int], tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
+    database: Path, num_images: int, most_pairs: int | None = None, most_matches: int | None = None
+) -> VerifiedMatches:
     """Verified matches of pairs of indices: places in pixels in the one and the other, [M, 2] each.
+
+    most_pairs, most_matches: of each pair, evenly picked where there are more.
 
     Call it only while pycolmap has the database closed.
     """
@@ -177,13 +192,25 @@ def read_matches(
         ):
             values = np.frombuffer(blob, np.float32).reshape(rows, columns)
             places[index_of[image_id]] = values[:, :2].astype(np.float64)
-        for pair_id, rows, blob in connection.execute(
-            "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0"
+        (count,) = connection.execute(
+            "SELECT COUNT(*) FROM two_view_geometries WHERE rows > 0"
+        ).fetchone()
+        kept = set(_evenly(count, most_pairs).tolist())
+        for number, (pair_id, rows, blob) in enumerate(
+            connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
         ):
+            if number not in kept:
+                continue
             i, j = (index_of[image] for image in pycolmap.pair_id_to_image_pair(pair_id))
-            matches = np.frombuffer(blob, np.uint32).reshape(rows, 2)
+            matches = np.frombuffer(blob, np.uint32).reshape(rows, 2)[_evenly(rows, most_matches)]
             found[i, j] = places[i][matches[:, 0]], places[j][matches[:, 1]]
     return found
+
+
+def _evenly(count: int, most: int | None) -> npt.NDArray[np.int64]:
+    """Indices of `count`, at most `most` of them."""
+    num = count if most is None else min(count, most)
+    return np.linspace(0, max(count - 1, 0), num).round().astype(np.int64)
 
 
 def _centred(width: int, height: int) -> npt.NDArray[np.float64]:
