@@ -132,6 +132,11 @@ class PosesOptions(StageOptions):
     refine_principal_point: bool = Field(
         False, description="Fit the principal point too; needs many views."
     )
+    subpixel: bool = Field(
+        False,
+        description="After mapping, look for each feature's patch in the other pictures that show "
+        "it, to a fraction of a pixel, and adjust poses, points and lens to that.",
+    )
     orientation: Literal["auto", "none"] = Field(
         "auto", description="Turn the world so that gravity points along -Z."
     )

@@ -3,7 +3,8 @@
 Reads the images of `frames` (videos) or `ingest` (photos). Writes cameras.json (registered images
 only, of panoramas their views; gravity along -Z, cameras in [-1, 1]^3), points.ply (sparse,
 coloured, same frame) and report.json (what registered, what did not and why, every attempt made,
-which lens and how well it is known); where no usable poses are found, report.json alone. The parts:
+how keypoints were refined, which lens and how well it is known); where no usable poses are found,
+report.json alone. The parts:
 `pipelines.sfm` (which images, which pairs, attempts, verdict, lenses), `pipelines.tools.colmap`,
 `pipelines.scene.orientation`.
 """
@@ -27,7 +28,8 @@ from pipelines.sfm.found_images import FoundImages, found_images
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled
 from pipelines.sfm.report import build_report, check_usable, report_of_failure, report_of_model
 from pipelines.sfm.rungs import RUNGS
-from pipelines.sfm.source import read_source
+from pipelines.sfm.source import Source, read_source
+from pipelines.sfm.subpixel import refine_model
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import SparseModel
@@ -46,6 +48,7 @@ _SUMMARY = (
     "agreement",
     "num_points",
     "num_cameras",
+    "subpixel",
     "intrinsics",
     "warnings",
     "models",
@@ -76,6 +79,7 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         except (PosesError, ToolError) as error:
             _write_report(ctx, report_of_failure(ladder.outcome, source, options, error))
             raise
+        model, refinement = _refine(reconstructor, model, source, options, ctx)
         if source.has_panoramas:
             lenses = unsettled(model)
         else:
@@ -88,6 +92,7 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     write_cameras(ctx.out / "cameras.json", found, world, notes)
     write_sparse_points(ctx.out / SPARSE_POINTS, model, world)
     report = {**build_report(outcome, source), **report_of_model(model, lenses, notes)}
+    report["subpixel"] = refinement
     _write_report(ctx, report)
     ctx.progress(1.0, f"{len(model.indices)} of {len(source.files)} images registered", 0.0)
     return {key: report[key] for key in _SUMMARY}
@@ -99,6 +104,37 @@ def _num_threads(options: PosesOptions, ctx: StageContext) -> int:
         return options.num_threads
     wanted = options.num_threads if options.num_threads > 0 else num_processors()
     return max(wanted // 2, 1)
+
+
+def _refine(
+    reconstructor: Reconstructor,
+    model: SparseModel,
+    source: Source,
+    options: PosesOptions,
+    ctx: StageContext,
+) -> tuple[SparseModel, dict[str, float | int] | None]:
+    """The model with its keypoints refined, and what report.json says of that."""
+    num_threads = _num_threads(options, ctx)
+    refined, found = refine_model(
+        reconstructor,
+        model,
+        source,
+        options,
+        lambda share: ctx.progress(0.97 + 0.01 * share, "refining keypoints"),
+        num_threads if num_threads > 0 else num_processors(),
+    )
+    if found is None:
+        return refined, None
+    ctx.logger.info(
+        "%d of %d observations moved by %.2f px (median), %d dropped; error %.2f px, was %.2f",
+        found.num_moved,
+        found.num_observations,
+        found.median_move_px,
+        found.num_dropped,
+        found.error_after_px,
+        found.error_before_px,
+    )
+    return refined, found.as_dict()
 
 
 def _settle_lenses(

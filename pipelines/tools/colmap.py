@@ -42,6 +42,7 @@ from pipelines.tools.colmap_results import (
     read_statistics,
     sparse_model,
 )
+from pipelines.tools.colmap_tracks import StoredTracks
 
 Watch = Callable[[int], None]
 """Called every half second with the number of items done; what it raises ends the call."""
@@ -307,6 +308,16 @@ class Reconstructor:
         Their pairs must be matched again, which only verifies what was matched before.
         """
         set_lens(self.database, self.names, indices, lens, focal_px)
+
+    def stored_tracks(self, model: SparseModel, poll: Callable[[], None]) -> StoredTracks:
+        """The tracks of a model that `map` found. poll: what it raises ends an adjustment."""
+        if model.stored is None:
+            raise ValueError("the model was not written by COLMAP")
+        return StoredTracks(
+            model.stored,
+            num_threads=self.num_threads,
+            run=lambda what, call: self._run(what, call, poll),
+        )
 
     def statistics(self) -> PairStatistics:
         """What extraction and matching put into the database. Not while another call runs."""

@@ -12,8 +12,7 @@ by COLMAP's camera id.
 from __future__ import annotations
 
 import copy
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +21,10 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from pipelines.tools.colmap_adjustment import Rounds, Run, adjust
 from pipelines.tools.colmap_results import LENS_PARAMETERS, SparseModel, sparse_model
 
 Floats = npt.NDArray[np.float64]
-Run = Callable[[str, Callable[[Any], Any]], Any]
-"""`(what, call)`: runs `call(token)` where it can be cancelled, and returns what it returns."""
 
 MIN_TRACK = 4
 """Observations of a track of which some are held out, one in so many: at least three stay, of which
@@ -35,11 +33,9 @@ ENOUGH_OBSERVATIONS = 12_000
 ENOUGH_PER_IMAGE = 200
 """Tracks are taken until they have so many observations, whichever is more: enough to fix every
 pose and to tell lenses apart, and a fraction of what mapping adjusts many times (docs/poses.md)."""
-_ITERATIONS, _ROUNDS = 10, 5
-"""A round of iterations cannot be interrupted; between two of them a cancel is noticed."""
-_TOLERANCE = 1e-6
-"""Relative change of the cost at which an adjustment ends; COLMAP's own goes on for 2 to 3 times as
-many rounds, for errors that are equal in four digits."""
+_ENDS = Rounds(iterations=10, rounds=5, tolerance=1e-6)
+"""COLMAP's own tolerance goes on for 2 to 3 times as many rounds, for errors that are equal in four
+digits."""
 
 
 @dataclass(frozen=True)
@@ -162,23 +158,15 @@ class LensTrials:
         return sparse_model(whole, self._folder)
 
     def _adjust(self, reconstruction: Any, *, refine_focal: bool) -> None:
-        options = pycolmap.BundleAdjustmentOptions()
-        options.print_summary = False
-        options.refine_focal_length = refine_focal
-        options.refine_principal_point = self._principal
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-        options.ceres.solver_options.num_threads = self._num_threads
-        options.ceres.solver_options.max_num_iterations = _ITERATIONS
-        options.ceres.solver_options.function_tolerance = _TOLERANCE
-        config = pycolmap.BundleAdjustmentConfig()
-        for image_id in reconstruction.reg_image_ids():
-            config.add_image(image_id)
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        for _ in range(_ROUNDS):
-            adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-            summary = self._run("fitting the lens", functools.partial(_solve, adjuster))
-            if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
-                break
+        adjust(
+            reconstruction,
+            _ENDS,
+            what="fitting the lens",
+            run=self._run,
+            num_threads=self._num_threads,
+            refine_focal=refine_focal,
+            refine_principal_point=self._principal,
+        )
 
     def _errors(self, fitted: Any) -> Floats:
         """Distance of each held-out observation from where its point is seen now, [H] pixels."""
@@ -196,12 +184,6 @@ class LensTrials:
             errors[seen] = np.linalg.norm(pixels.reshape(-1, 2) - self._held_xy[seen], axis=1)
         errors[~np.isfinite(errors)] = np.inf
         return errors
-
-
-def _solve(adjuster: Any, token: Any) -> Any:
-    """One round; it cannot be cancelled by the token."""
-    del token
-    return adjuster.solve()
 
 
 def change_lens(camera: Any, lens: str) -> None:

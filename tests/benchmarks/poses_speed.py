@@ -11,7 +11,7 @@ relative to the largest distance between two of them, of rotations in degrees. A
 poses were measured too, so errors against them have a floor.
 
 Ways: defaults (COLMAP's own), ours, ours with one option changed (upsample, coarse, exhaustive,
-sequential, retrieval), global (ours with global instead of incremental mapping).
+sequential, retrieval, subpixel), global (ours with global instead of incremental mapping).
 """
 
 from __future__ import annotations

@@ -24,10 +24,11 @@ import pycolmap
 
 from pipelines.options import PosesOptions, resolve_options
 from pipelines.scene.orientation import opengl_from_opencv
-from pipelines.sfm.attempts import Checkpoint, Ladder
+from pipelines.sfm.attempts import Checkpoint, Ladder, num_processors
 from pipelines.sfm.intrinsics import settle_lenses
 from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source, read_source
+from pipelines.sfm.subpixel import refine_model
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import SparseModel, best_model, sparse_model
@@ -46,6 +47,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     "exhaustive": {"matcher": "exhaustive"},
     "sequential": {"matcher": "sequential"},
     "retrieval": {"matcher": "retrieval"},
+    "subpixel": {"subpixel": True},
 }
 """Ways that are the product's with other options."""
 WAYS = (DEFAULTS, *OVERRIDES, GLOBAL)
@@ -121,6 +123,14 @@ def our_way(
     )
     model = Ladder(reconstructor, checkpoint, source, options, ctx).climb().chosen.best
     if model is not None:
+        model, _ = refine_model(
+            reconstructor,
+            model,
+            source,
+            options,
+            lambda share: phases.on_progress(0.97 + 0.01 * share, "placing", None),
+            options.num_threads if options.num_threads > 0 else num_processors(),
+        )
         trials = reconstructor.lens_trials(
             model,
             lambda: phases.on_progress(0.98, "placing", None),

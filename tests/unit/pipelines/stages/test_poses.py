@@ -28,7 +28,7 @@ from tests.unit.pipelines.sfm.synthetic_room import (
     turning_poses,
 )
 
-OPTIONS = PosesOptions(num_features=1500, max_image_px=400)
+OPTIONS = PosesOptions(num_features=1500, max_image_px=400, subpixel=True)
 
 
 def context(root: Path, **more: Any) -> StageContext:
@@ -119,6 +119,10 @@ def test_the_report_says_which_frame_is_missing_and_why(job: tuple[Path, Any, An
     assert (report["num_images"], report["num_registered"]) == (12, 11)
     assert report["registered_ratio"] == pytest.approx(11 / 12)
     assert report["mean_reprojection_error_px"] < 1.0
+    refined = report["subpixel"]
+    assert refined["num_moved"] > 0.5 * refined["num_observations"] > 100
+    assert refined["error_after_px"] < 0.8 * refined["error_before_px"]
+    assert report["mean_reprojection_error_px"] < 1.2 * refined["error_after_px"]
     assert report["metric"] is False
     found = report["intrinsics"]
     assert (found["model"], found["num_images"]) == ("SIMPLE_RADIAL", 11)

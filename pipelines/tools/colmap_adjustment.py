@@ -1,0 +1,62 @@
+"""Bundle adjustment of a `pycolmap.Reconstruction`, in rounds between which it can be cancelled."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pycolmap
+
+Run = Callable[[str, Callable[[Any], Any]], Any]
+"""`(what, call)`: runs `call(token)` where it can be cancelled, and returns what it returns."""
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """When an adjustment ends.
+
+    A round of `iterations` cannot be interrupted; between two of them a cancel is noticed.
+    tolerance: relative change of the cost at which all ends.
+    """
+
+    iterations: int
+    rounds: int
+    tolerance: float
+
+
+def adjust(
+    reconstruction: Any,
+    ends: Rounds,
+    *,
+    what: str,
+    run: Run,
+    num_threads: int,
+    refine_focal: bool = True,
+    refine_principal_point: bool = False,
+) -> None:
+    """Adjust poses, points and lenses; errors beyond a pixel count less (soft L1)."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = refine_focal
+    options.refine_principal_point = refine_principal_point
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = num_threads
+    options.ceres.solver_options.max_num_iterations = ends.iterations
+    options.ceres.solver_options.function_tolerance = ends.tolerance
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for _ in range(ends.rounds):
+        adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+        summary = run(what, functools.partial(_solve, adjuster))
+        if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
+            break
+
+
+def _solve(adjuster: Any, token: Any) -> Any:
+    """One round; it cannot be cancelled by the token."""
+    del token
+    return adjuster.solve()
