@@ -146,7 +146,7 @@ def _best_plane(points: Floats, normals: Floats, scale: Floats, rng: np.random.G
     candidates = np.column_stack([normals[tried], offsets])
     worth = []
     for plane in candidates:
-        far = _away(plane, points) / (_NEAR * scale)
+        far = distances(plane, points) / (_NEAR * scale)
         worth.append(np.maximum(1.0 - far**2, 0.0)[_aligned(plane, normals, _ALIGNED)].sum())
     best: Floats = candidates[int(np.argmax(worth))]
     for _ in range(_FITS):
@@ -160,7 +160,7 @@ def _best_plane(points: Floats, normals: Floats, scale: Floats, rng: np.random.G
 def _fitted(plane: Floats, points: Floats, scale: Floats) -> Floats:
     """The plane [4] of points [K, 3] with so much noise each, those far from it counting less."""
     for _ in range(_FIT_ROUNDS):
-        far = _away(plane, points) / (_FIT_SCALE * scale)
+        far = distances(plane, points) / (_FIT_SCALE * scale)
         weights = 1.0 / (scale**2 * (1.0 + far**2))
         middle = weights @ points / weights.sum()
         apart = points - middle
@@ -186,7 +186,7 @@ def _regular(plane: Floats, others: list[Floats], points: Floats, scale: Floats)
             normal = unit_normals((normal - cosine * other[:3])[None])[0]
     made = np.append(normal, np.median(points @ normal))
     for _ in range(_FIT_ROUNDS):
-        weights = 1.0 / (scale**2 * (1.0 + (_away(made, points) / (_FIT_SCALE * scale)) ** 2))
+        weights = 1.0 / (scale**2 * (1.0 + (distances(made, points) / (_FIT_SCALE * scale)) ** 2))
         made[3] = weights @ (points @ normal) / weights.sum()
     before, after = (_unevenness(given, points, scale) for given in (plane, made))
     return made if after < _OBJECTION * before else plane
@@ -194,14 +194,14 @@ def _regular(plane: Floats, others: list[Floats], points: Floats, scale: Floats)
 
 def _unevenness(plane: Floats, points: Floats, scale: Floats) -> float:
     """The median distance of points [K, 3] from a plane, in edges."""
-    return float(np.median(np.abs(_away(plane, points)) / scale))
+    return float(np.median(np.abs(distances(plane, points)) / scale))
 
 
 def _members(
     vertices: Floats, normals: Floats, lengths: Floats, planes: Floats, rings: MeshRings
 ) -> Ints:
     """[V]: the nearest plane of those that each vertex lies on; then on into the corners."""
-    far = np.stack([np.abs(_away(plane, vertices)) for plane in planes], axis=-1)
+    far = np.stack([np.abs(distances(plane, vertices)) for plane in planes], axis=-1)
     far /= np.maximum(lengths, 1e-12)[:, None]
     aligned = np.stack([_aligned(plane, normals, _MEMBER_ALIGNED) for plane in planes], axis=-1)
     on = (far < _NEAR) & aligned
@@ -218,7 +218,7 @@ def _without_small_and_bent(
     vertices: Floats, lengths: Floats, planes: Floats, plane_of: Ints, rings: MeshRings
 ) -> Ints:
     """`plane_of` without regions that are small, or a part of something curved."""
-    edges = _within(plane_of, rings)
+    edges = edges_within(plane_of, rings)
     _, region_of = connected_components(edges, directed=False)
     areas = rings.areas(vertices)
     large = np.bincount(region_of, areas) >= _LEAST_AREA * areas.sum()
@@ -229,18 +229,18 @@ def _without_small_and_bent(
         if not large[region_of[members[0]]]:
             continue
         plane = planes[plane_of[members[0]]]
-        if not _is_bent(plane, vertices[members], lengths[members]):
+        if not is_bent(plane, vertices[members], lengths[members]):
             kept[members] = plane_of[members]
     return kept
 
 
-def _is_bent(plane: Floats, points: Floats, lengths: Floats) -> bool:
+def is_bent(plane: Floats, points: Floats, lengths: Floats) -> bool:
     """Whether the distances of points [K, 3] to their plane are mostly those of a quadric."""
     middle = points.mean(axis=0)
     _, axes = np.linalg.eigh((points - middle).T @ (points - middle))
     u, v = ((points - middle) @ axes[:, 1:]).T
     u, v = u / max(np.abs(u).max(), 1e-30), v / max(np.abs(v).max(), 1e-30)
-    far = _away(plane, points) / np.maximum(lengths, 1e-12)
+    far = distances(plane, points) / np.maximum(lengths, 1e-12)
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     explained = terms @ np.linalg.lstsq(terms, far, rcond=None)[0]
     explained_rms = float(np.sqrt((explained**2).mean()))
@@ -263,13 +263,13 @@ def _in_relief(
 
 def _shared(wanted: Floats, trust: Floats, plane_of: Ints, rings: MeshRings) -> Floats:
     """[V]: the distances to the planes that photos answer for and neighbours share."""
-    edges = _within(plane_of, rings)
+    edges = edges_within(plane_of, rings)
     degree = np.asarray(edges.sum(axis=1)).ravel()
     matrix = diags_array(trust + _TO_PLANE) + _SMOOTH * (diags_array(degree) - edges)
     return _solved(matrix.tocsr(), trust * wanted)
 
 
-def _within(plane_of: Ints, rings: MeshRings) -> csr_array:
+def edges_within(plane_of: Ints, rings: MeshRings) -> csr_array:
     """[V, V]: 1 where an edge joins two vertices of one plane."""
     pairs = rings.around.tocoo()
     same = (plane_of[pairs.row] == plane_of[pairs.col]) & (plane_of[pairs.row] != NOWHERE)
@@ -290,7 +290,7 @@ def _solved(matrix: csr_array, wanted: Floats) -> Floats:
     return solved
 
 
-def _away(plane: Floats, points: Floats) -> Floats:
+def distances(plane: Floats, points: Floats) -> Floats:
     """[K]: signed distances."""
     signed: Floats = points @ plane[:3] - plane[3]
     return signed
@@ -305,5 +305,5 @@ def _near(
     plane: Floats, points: Floats, normals: Floats, scale: Floats, slack: float = 1.0
 ) -> NDArray[np.bool_]:
     """[K]: which points lie on the plane and face as it does."""
-    on: NDArray[np.bool_] = np.abs(_away(plane, points)) < slack * _NEAR * scale
+    on: NDArray[np.bool_] = np.abs(distances(plane, points)) < slack * _NEAR * scale
     return on & _aligned(plane, normals, 1.0 - slack * (1.0 - _ALIGNED))
