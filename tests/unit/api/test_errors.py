@@ -45,6 +45,7 @@ V1_CALLS = [
     ("GET", "/v1/jobs/x/logs"),
     ("GET", "/v1/presets"),
     ("GET", "/v1/options"),
+    ("GET", "/v1/workers"),
 ]
 
 
@@ -282,7 +283,7 @@ def test_openapi_names_operations_and_the_shape_of_errors(service: Service) -> N
             *("get_job_logs", "retry_job", "list_job_events"),
         ),
         *("list_artifacts", "download_artifact", "download_object"),
-        *("list_presets", "get_options_schema", "get_liveness", "get_readiness"),
+        *("list_presets", "get_options_schema", "get_liveness", "get_readiness", "list_workers"),
     }
     assert {"Problem", "FieldProblem"} <= set(document["components"]["schemas"])
     for path, calls in document["paths"].items():
