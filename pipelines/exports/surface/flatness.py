@@ -9,9 +9,10 @@ neighbours share:
     min_d  sum_i t_i (d_i - a_i)^2 + e d_i^2 + s sum_edges (d_i - d_j)^2
 
 with a the photos' answer and t its trust: a plain wall (t = 0) becomes plane, a textured one smooth
-but as bent as its pictures say, and what stands out by more than an edge in the pictures stays as
-it is. Sources: Schnabel, Wahl, Klein, "Efficient RANSAC for Point-Cloud Shape Detection", CGF 2007;
-Torr, Zisserman, "MLESAC", CVIU 2000 (a hypothesis is worth more the nearer its points are).
+but as bent as its pictures say, and what stands out by more than half an edge in the pictures, or
+is the rim of a plane, stays as it is. Sources: Schnabel, Wahl, Klein, "Efficient RANSAC for
+Point-Cloud Shape Detection", CGF 2007; Torr, Zisserman, "MLESAC", CVIU 2000 (a hypothesis is worth
+more the nearer its points are).
 
 Symbols: V vertices, F faces, P planes (n, d) with n . X = d, n of length 1.
 """
@@ -49,13 +50,15 @@ _NEARLY_DEG, _OBJECTION = 5.0, 1.5
 so much farther away."""
 _LEAST_AREA = 0.003
 """Of the mesh's area, for a connected region to be a plane's."""
-_BENT, _BENT_SHARE = 0.5, 0.5
+_BENT, _BENT_SHARE = 0.35, 0.5
 """Of a region's distances, in edges: what a quadric explains. So much is part of a curved thing."""
 _NORMAL_ROUNDS, _CORNER_ROUNDS, _RELIEF_ROUNDS = 8, 2, 6
 _CORNER = 1.0
-_RELIEF, _RELIEF_TRUST = 1.0, 0.25
+_INSIDE, _INSIDE_ROUNDS = 0.9, 20
+_RELIEF, _RELIEF_TRUST = 0.5, 0.25
+_SURE, _SLACK = 0.3, 1.5
 _SMOOTH, _TO_PLANE = 10.0, 0.005
-_HOLD, _MOVE = 0.3, 30.0
+_HOLD, _MOVE = 3.0, 30.0
 _ITERATIONS, _TOLERANCE = 200, 1e-4
 
 
@@ -65,6 +68,19 @@ class FlatParts:
 
     planes: Floats
     plane_of: Ints
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the photos say of V vertices.
+
+    offset: [V], how far along its normal they want each. trust: [V] in [0, 1], in that.
+    half_pixel: [V], along the normal, what moves a vertex by half a pixel in them.
+    """
+
+    offset: Floats
+    trust: Floats
+    half_pixel: Floats
 
 
 def find_flat_parts(vertices: Floats, rings: MeshRings) -> FlatParts:
@@ -81,16 +97,13 @@ def find_flat_parts(vertices: Floats, rings: MeshRings) -> FlatParts:
 
 
 def flattened(
-    vertices: Floats,
-    parts: FlatParts,
-    rings: MeshRings,
-    answers: Floats | None = None,
-    trust: Floats | None = None,
+    vertices: Floats, parts: FlatParts, rings: MeshRings, answers: Answers | None = None
 ) -> Floats:
     """The vertices [V, 3] with their flat parts flat; those around them go along.
 
-    answers: [V], how far along its normal the photos want each vertex; trust: [V] in [0, 1], of
-    each. Without them everything that is flat becomes plane.
+    Without answers what stands out all around by half an edge stays as it is; with them what the
+    photos say stands out, and no vertex that they are sure of leaves their answer by more than
+    three quarters of a pixel.
     """
     plane_of = parts.plane_of
     on = plane_of != NOWHERE
@@ -98,12 +111,17 @@ def flattened(
         return vertices
     normals = parts.planes[np.maximum(plane_of, 0), :3]
     away = (vertices * normals).sum(axis=1) - parts.planes[np.maximum(plane_of, 0), 3]
-    kept = np.zeros(len(vertices))
-    if answers is not None and trust is not None:
-        wanted = away + answers * (rings.normals(vertices) * normals).sum(axis=1)
-        believed = np.where(on, trust, 0.0)
-        on = on & ~_in_relief(wanted, believed, on, rings.edge_lengths(vertices), rings)
-        kept = _shared(wanted, np.where(on, believed, 0.0), np.where(on, plane_of, NOWHERE), rings)
+    lengths = rings.edge_lengths(vertices)
+    if answers is None:
+        on = on & ~_in_relief(away, on.astype(np.float64), on, lengths, rings)
+        kept = np.zeros(len(vertices))
+    else:
+        wanted = away + answers.offset * (rings.normals(vertices) * normals).sum(axis=1)
+        trust = np.where(on, answers.trust, 0.0)
+        on = on & ~_in_relief(wanted, trust, on, lengths, rings)
+        kept = _shared(wanted, np.where(on, trust, 0.0), np.where(on, plane_of, NOWHERE), rings)
+        slack = np.where(trust > _SURE, _SLACK * answers.half_pixel, np.inf)
+        kept = np.clip(kept, wanted - slack, wanted + slack)
     moves = np.where(on[:, None], (kept - away)[:, None] * normals, 0.0)
     weights = np.where(on, _MOVE, _HOLD)
     matrix = (diags_array(weights) + rings.laplacian).tocsr()
@@ -200,7 +218,10 @@ def _unevenness(plane: Floats, points: Floats, scale: Floats) -> float:
 def _members(
     vertices: Floats, normals: Floats, lengths: Floats, planes: Floats, rings: MeshRings
 ) -> Ints:
-    """[V]: the nearest plane of those that each vertex lies on; then on into the corners."""
+    """[V]: the nearest plane of those that each vertex lies on, without its rim.
+
+    The edge of a box lies near both of its sides: laid on either, it would be torn.
+    """
     far = np.stack([np.abs(distances(plane, vertices)) for plane in planes], axis=-1)
     far /= np.maximum(lengths, 1e-12)[:, None]
     aligned = np.stack([_aligned(plane, normals, _MEMBER_ALIGNED) for plane in planes], axis=-1)
@@ -211,6 +232,10 @@ def _members(
         for index in range(len(planes)):
             beside = rings.around @ (plane_of == index).astype(np.float64) > 0.0
             plane_of[(plane_of == NOWHERE) & beside & (far[:, index] < _CORNER)] = index
+    for index in range(len(planes)):
+        on_it = plane_of == index
+        share = rings.spread(on_it.astype(np.float64)[:, None], _INSIDE_ROUNDS)[:, 0]
+        plane_of[on_it & (share < _INSIDE)] = NOWHERE
     return plane_of.astype(np.intp)
 
 

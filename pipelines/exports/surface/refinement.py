@@ -26,7 +26,7 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import cg
 
 from pipelines.exports.mesh import TriangleMesh, unit_normals
-from pipelines.exports.surface.flatness import find_flat_parts, flattened
+from pipelines.exports.surface.flatness import Answers, find_flat_parts, flattened
 from pipelines.exports.surface.plain import with_plain_parts
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
@@ -87,11 +87,12 @@ def refined(
         vertices = vertices + moves[:, None] * smooth
         on_progress((index + 1) / len(_ROUNDS))
     if flat:
-        answers = offsets.length.astype(np.float64) - moves
+        left = offsets.length.astype(np.float64) - moves
         trust = offsets.trust.astype(np.float64)
         parts = find_flat_parts(vertices, rings)
         parts = with_plain_parts(parts, vertices, rings, mesh.colors, trust)
-        vertices = flattened(vertices, parts, rings, answers, trust)
+        answers = Answers(left, trust, offsets.step.astype(np.float64))
+        vertices = flattened(vertices, parts, rings, answers)
     moved = replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
     return moved.with_faces(_shown_faces(mesh.faces, seen, rings))
 

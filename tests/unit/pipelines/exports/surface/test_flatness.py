@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.exports.surface.flatness import NOWHERE, find_flat_parts, flattened
+from pipelines.exports.surface.flatness import NOWHERE, Answers, find_flat_parts, flattened
 from pipelines.exports.surface.rings import MeshRings
 
 Floats = NDArray[np.float64]
 STEP = 0.02
+HALF_PIXEL = 0.3 * STEP
 SIDE = 61
 
 
@@ -106,6 +107,12 @@ def test_a_ball_stays_a_ball() -> None:
     assert np.abs(np.linalg.norm(flat, axis=1) - 1.0).max() < 0.02
 
 
+def told(points: Floats, trust: float) -> Answers:
+    """Photos that are as sure that all is where it is."""
+    count = len(points)
+    return Answers(np.zeros(count), np.full(count, trust), np.full(count, HALF_PIXEL))
+
+
 def with_relief() -> tuple[Floats, MeshRings, NDArray[np.bool_]]:
     """A floor with a slab of 1.5 edges on it."""
     points = sheet(0 * X, X, Y) - 0.5 * SIDE * STEP * (X + Y)
@@ -118,9 +125,8 @@ def with_relief() -> tuple[Floats, MeshRings, NDArray[np.bool_]]:
 def test_what_stands_out_in_the_photos_stays() -> None:
     points, rings, slab = with_relief()
     parts = find_flat_parts(points, rings)
-    nothing, all_of_it = np.zeros(len(points)), np.ones(len(points))
-    blind = flattened(points, parts, rings, nothing, nothing)
-    sure = flattened(points, parts, rings, nothing, all_of_it)
+    blind = flattened(points, parts, rings, told(points, 0.0))
+    sure = flattened(points, parts, rings, told(points, 1.0))
     inside = (np.abs(points[:, :2]) < 0.1).all(axis=1)
     assert np.abs(blind[inside, 2] - np.median(blind[~slab, 2])).max() < 0.2 * STEP
     assert np.median(sure[inside, 2]) - np.median(sure[~slab, 2]) > 1.2 * STEP
@@ -134,7 +140,7 @@ def test_a_textured_floor_stays_as_bent_as_its_pictures_say() -> None:
     rings = MeshRings(faces_of(SIDE), len(points))
     parts = find_flat_parts(points, rings)
     assert (parts.plane_of != NOWHERE).mean() > 0.95
-    told = flattened(points, parts, rings, np.zeros(len(points)), np.ones(len(points)))[:, 2]
-    blind = flattened(points, parts, rings)
-    assert np.abs(told - told.mean() - (bow - bow.mean())).mean() < 0.4 * np.abs(noise).mean()
+    bent = flattened(points, parts, rings, told(points, 1.0))[:, 2]
+    blind = flattened(points, parts, rings, told(points, 0.0))
+    assert np.abs(bent - bent.mean() - (bow - bow.mean())).mean() < 0.4 * np.abs(noise).mean()
     assert np.linalg.svd(blind - blind.mean(axis=0), full_matrices=False)[1][2] < 1e-6

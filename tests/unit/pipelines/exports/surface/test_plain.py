@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.exports.surface.flatness import NOWHERE, find_flat_parts, flattened
+from pipelines.exports.surface.flatness import NOWHERE, Answers, find_flat_parts, flattened
 from pipelines.exports.surface.plain import with_plain_parts
 from pipelines.exports.surface.rings import MeshRings
 from tests.unit.pipelines.exports.surface.test_flatness import STEP, X, Y, Z, faces_of, sheet
@@ -38,7 +38,8 @@ def spread_of(points: Floats) -> float:
 
 def laid(points: Floats, rings: MeshRings, colors: Floats, trust: Floats) -> Floats:
     parts = with_plain_parts(find_flat_parts(points, rings), points, rings, colors, trust)
-    return flattened(points, parts, rings, np.zeros(len(points)), trust)
+    answers = Answers(np.zeros(len(points)), trust, np.full(len(points), 0.1 * STEP))
+    return flattened(points, parts, rings, answers)
 
 
 def test_a_plain_table_is_flat_and_where_it_was() -> None:
