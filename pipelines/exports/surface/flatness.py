@@ -19,6 +19,7 @@ Symbols: V vertices, F faces, P planes (n, d) with n . X = d, n of length 1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,15 +84,20 @@ class Answers:
     half_pixel: Floats
 
 
-def find_flat_parts(vertices: Floats, rings: MeshRings) -> FlatParts:
-    """The planes of a mesh [V, 3] that is centred near the origin, and what lies on them."""
+def find_flat_parts(
+    vertices: Floats, rings: MeshRings, poll: Callable[[], None] = lambda: None
+) -> FlatParts:
+    """The planes of a mesh [V, 3] that is centred near the origin, and what lies on them.
+
+    poll: called now and then; may raise.
+    """
     normals = unit_normals(rings.spread(rings.normals(vertices), _NORMAL_ROUNDS))
     lengths = rings.edge_lengths(vertices)
-    planes = _planes(vertices, normals, lengths, rings.areas(vertices))
+    planes = _planes(vertices, normals, lengths, rings.areas(vertices), poll)
     nowhere = np.full(len(vertices), NOWHERE, np.intp)
     if len(planes) == 0:
         return FlatParts(planes, nowhere)
-    plane_of = _members(vertices, normals, lengths, planes, rings)
+    plane_of = _members(vertices, normals, lengths, planes, rings, poll)
     plane_of = _without_small_and_bent(vertices, lengths, planes, plane_of, rings)
     return FlatParts(planes, plane_of)
 
@@ -131,7 +137,13 @@ def flattened(
     return flat
 
 
-def _planes(vertices: Floats, normals: Floats, lengths: Floats, areas: Floats) -> Floats:
+def _planes(
+    vertices: Floats,
+    normals: Floats,
+    lengths: Floats,
+    areas: Floats,
+    poll: Callable[[], None],
+) -> Floats:
     """[P, 4]: planes that at least 1 % of the surface lies on, largest first."""
     rng = np.random.default_rng(0)
     # A few huge faces must not be all that is looked at.
@@ -142,6 +154,7 @@ def _planes(vertices: Floats, normals: Floats, lengths: Floats, areas: Floats) -
     least = max(_LEAST_SHARE * count, _LEAST_SAMPLES)
     found: list[Floats] = []
     for _ in range(_MOST_PLANES):
+        poll()
         if len(points) < least:
             break
         plane = _best_plane(points, facing, scale, rng)
@@ -216,7 +229,12 @@ def _unevenness(plane: Floats, points: Floats, scale: Floats) -> float:
 
 
 def _members(
-    vertices: Floats, normals: Floats, lengths: Floats, planes: Floats, rings: MeshRings
+    vertices: Floats,
+    normals: Floats,
+    lengths: Floats,
+    planes: Floats,
+    rings: MeshRings,
+    poll: Callable[[], None],
 ) -> Ints:
     """[V]: the nearest plane of those that each vertex lies on, without its rim.
 
@@ -233,6 +251,7 @@ def _members(
             beside = rings.around @ (plane_of == index).astype(np.float64) > 0.0
             plane_of[(plane_of == NOWHERE) & beside & (far[:, index] < _CORNER)] = index
     for index in range(len(planes)):
+        poll()
         on_it = plane_of == index
         share = rings.spread(on_it.astype(np.float64)[:, None], _INSIDE_ROUNDS)[:, 0]
         plane_of[on_it & (share < _INSIDE)] = NOWHERE

@@ -47,6 +47,8 @@ _CLEAR = 0.3
 _NORMAL_ROUNDS = 2
 _LEAST_VIEWS = 2
 _SIGHT_SHARE, _POINTS_SHARE = 0.3, 0.5
+_FLAT_SHARE = 0.1
+"""Of the progress, for what is flat: first and last."""
 _ITERATIONS, _TOLERANCE = 200, 1e-4
 
 
@@ -68,16 +70,22 @@ def refined(
     vertices = mesh.vertices - origin
     rings = MeshRings(mesh.faces, len(vertices))
     if flat:
-        vertices = flattened(vertices, find_flat_parts(vertices, rings), rings)
+        parts = find_flat_parts(vertices, rings, lambda: on_progress(0.0))
+        vertices = flattened(vertices, parts, rings)
     sharp = _sharpness(vertices, rings)
+    photos_share = 1.0 - 2.0 * _FLAT_SHARE
+
+    def on_photos(done: float) -> None:
+        on_progress(_FLAT_SHARE + photos_share * done / len(_ROUNDS))
+
     for index, (factor, num_steps) in enumerate(_ROUNDS):
         normals = rings.normals(vertices)
 
         def on_view(done: float, before: int = index) -> None:
-            on_progress((before + _SIGHT_SHARE * done) / len(_ROUNDS))
+            on_photos(before + _SIGHT_SHARE * done)
 
         def on_point(done: float, before: int = index) -> None:
-            on_progress((before + _SIGHT_SHARE + _POINTS_SHARE * done) / len(_ROUNDS))
+            on_photos(before + _SIGHT_SHARE + _POINTS_SHARE * done)
 
         seen = _seen(vertices, normals, mesh.faces, views, origin, on_view)
         smooth = _smoothed(normals, rings)
@@ -85,14 +93,15 @@ def refined(
         offsets = photo_offsets(vertices, smooth, seen, pictures, num_steps, on_progress=on_point)
         moves = _agreed(offsets, rings, rings.edge_lengths(vertices), sharp)
         vertices = vertices + moves[:, None] * smooth
-        on_progress((index + 1) / len(_ROUNDS))
+        on_photos(index + 1)
     if flat:
         left = offsets.length.astype(np.float64) - moves
         trust = offsets.trust.astype(np.float64)
-        parts = find_flat_parts(vertices, rings)
+        parts = find_flat_parts(vertices, rings, lambda: on_photos(len(_ROUNDS)))
         parts = with_plain_parts(parts, vertices, rings, mesh.colors, trust)
         answers = Answers(left, trust, offsets.step.astype(np.float64))
         vertices = flattened(vertices, parts, rings, answers)
+    on_progress(1.0)
     moved = replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
     return moved.with_faces(_shown_faces(mesh.faces, seen, rings))
 

@@ -144,3 +144,13 @@ def test_a_textured_floor_stays_as_bent_as_its_pictures_say() -> None:
     blind = flattened(points, parts, rings, told(points, 0.0))
     assert np.abs(bent - bent.mean() - (bow - bow.mean())).mean() < 0.4 * np.abs(noise).mean()
     assert np.linalg.svd(blind - blind.mean(axis=0), full_matrices=False)[1][2] < 1e-6
+
+
+def test_it_can_be_stopped_while_it_looks() -> None:
+    bumpy, rings, _, _ = room(0.4)
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        find_flat_parts(bumpy, rings, stop)
