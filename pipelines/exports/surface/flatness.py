@@ -56,8 +56,11 @@ _BENT, _BENT_SHARE = 0.35, 0.5
 _NORMAL_ROUNDS, _CORNER_ROUNDS, _RELIEF_ROUNDS = 8, 2, 6
 _CORNER = 1.0
 _INSIDE, _INSIDE_ROUNDS = 0.9, 20
+"""Of what lies around a vertex, how much must be of its plane: its rim stays as it is."""
 _RELIEF, _RELIEF_TRUST = 0.5, 0.25
+"""Edges that a vertex and all around it stand out by, and the trust in that, to stay as they are."""
 _SURE, _SLACK = 0.3, 1.5
+"""Trust in the photos' answer, and half pixels that such a vertex may leave it by."""
 _SMOOTH, _TO_PLANE = 10.0, 0.005
 _HOLD, _MOVE = 3.0, 30.0
 _ITERATIONS, _TOLERANCE = 200, 1e-4
@@ -294,7 +297,7 @@ def is_bent(plane: Floats, points: Floats, lengths: Floats) -> bool:
 def _in_relief(
     wanted: Floats, trust: Floats, on: NDArray[np.bool_], lengths: Floats, rings: MeshRings
 ) -> NDArray[np.bool_]:
-    """[V]: where the photos say, all around, that the surface is not on its plane."""
+    """[V]: where what is trusted says, all around, that the surface is not on its plane."""
     in_edges = wanted / np.maximum(lengths, 1e-12)
     sums = rings.spread(
         np.stack([trust * in_edges, trust, on.astype(np.float64)], axis=-1), _RELIEF_ROUNDS
