@@ -58,7 +58,7 @@ _CORNER = 1.0
 _INSIDE, _INSIDE_ROUNDS = 0.9, 20
 """Of what lies around a vertex, how much must be of its plane: its rim stays as it is."""
 _RELIEF, _RELIEF_TRUST = 0.5, 0.25
-"""Edges that a vertex and all around it stand out by, and the trust in that, to stay as they are."""
+"""Edges that a vertex and all around it stand out by, and the trust in that, to stay as it is."""
 _SURE, _SLACK = 0.3, 1.5
 """Trust in the photos' answer, and half pixels that such a vertex may leave it by."""
 _SMOOTH, _TO_PLANE = 10.0, 0.005
