@@ -71,6 +71,36 @@ def joined(pieces: Sequence[TriangleMesh]) -> TriangleMesh:
     )
 
 
+def ordered(mesh: TriangleMesh) -> TriangleMesh:
+    """The same mesh whatever the order in which its vertices and faces came.
+
+    Who finds surfaces with several threads numbers them by chance, and what goes on from there, as
+    decimation does, follows the numbers: so each face begins with its least vertex, vertices and
+    faces are sorted, and vertices at one place become one. Faces that lose a corner by that go.
+    """
+    if len(mesh.vertices) == 0:
+        return mesh
+    told = np.concatenate([mesh.vertices, mesh.colors], axis=1)
+    order = np.lexsort(told.T[::-1])
+    places = mesh.vertices[order]
+    is_new = np.ones(len(order), np.bool_)
+    is_new[1:] = (places[1:] != places[:-1]).any(axis=1)
+    number = np.empty(len(order), np.int64)
+    number[order] = np.cumsum(is_new) - 1
+    faces = number[mesh.faces]
+    whole = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
+    faces = faces[whole]
+    first = faces.argmin(axis=1)[:, None]
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    kept = order[is_new]
+    return TriangleMesh(
+        mesh.vertices[kept], faces.astype(np.int32), mesh.colors[kept], mesh.normals[kept]
+    )
+
+
 def unit_normals(normals: Floats) -> Floats:
     """[V, 3] at length 1; one that has no direction is +Z."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)

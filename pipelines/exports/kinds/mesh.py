@@ -282,7 +282,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=7,
+    version=8,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

@@ -19,8 +19,8 @@ import numpy as np
 import open3d
 from numpy.typing import NDArray
 
-from pipelines.exports.mesh import TriangleMesh, empty_mesh
-from pipelines.exports.surface.open3d_mesh import from_open3d
+from pipelines.exports.mesh import TriangleMesh, empty_mesh, ordered
+from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.depth_views import DepthView
 
@@ -81,7 +81,9 @@ def fuse(
         on_view(done)
     # Open3D keeps voxels whose weight, the number of views, is above its threshold.
     extracted = grid.extract_triangle_mesh(_MIN_VIEWS - 0.5).to_legacy()
-    return from_open3d(extracted, origin)
+    # Its threads number vertices and faces as they come to them, another way in each run.
+    nowhere = np.zeros(3)
+    return from_open3d(to_open3d(ordered(from_open3d(extracted, nowhere)), nowhere), origin)
 
 
 def _farthest(view: DepthView) -> float:

@@ -43,6 +43,13 @@ def test_vertices_lie_within_a_voxel_of_the_sphere(sphere: TriangleMesh) -> None
     assert off.mean() < 0.2 * voxel
 
 
+def test_the_same_views_give_the_same_mesh_to_the_last_bit(views: list[DepthView]) -> None:
+    first, *others = (fuse(views, bounds_around(CENTER), VOXEL) for _ in range(3))
+    for other in others:
+        for name in ("vertices", "faces", "colors", "normals"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(first, name), name)
+
+
 def test_faces_and_normals_point_outwards(sphere: TriangleMesh) -> None:
     a, b, c = (sphere.vertices[sphere.faces[:, i]] for i in range(3))
     facing = (np.cross(b - a, c - a) * (a - CENTER)).sum(axis=1)
