@@ -7,7 +7,7 @@ as many texels per triangle as the one before has.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.reduction import reduced
@@ -17,10 +17,17 @@ LEAST_TRIANGLES = 64
 LEAST_TEXTURE_PX = 512
 
 
-def levels_of(mesh: TriangleMesh, count: int) -> Iterator[TriangleMesh]:
-    """The levels below a mesh, the finest first; a level never has fewer than a few triangles."""
+def levels_of(
+    mesh: TriangleMesh,
+    count: int,
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> Iterator[TriangleMesh]:
+    """The levels below a mesh, the finest first; a level never has fewer than a few triangles.
+
+    on_progress: as of `reduced`, for each level.
+    """
     for _ in range(count):
-        mesh = reduced(mesh, max(LEAST_TRIANGLES, len(mesh.faces) // SHARE))
+        mesh = reduced(mesh, max(LEAST_TRIANGLES, len(mesh.faces) // SHARE), on_progress)
         yield mesh
 
 

@@ -6,70 +6,117 @@ them the coarse triangles of what is far would count for more than the fine ones
 Open borders stay exactly as they are, as far as the triangles suffice for them. (Open3D's
 decimation is not used: it is three times as slow for the same distance to the surface, and its
 `boundary_weight`, as of 0.20, does not hold borders.)
-
-Source: Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", 1997, as
-pyfqmr does it.
+The work itself is `pipelines.exports.decimation`.
 """
 
 from __future__ import annotations
 
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import open3d
-import pyfqmr
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from pipelines.exports import decimation
+from pipelines.exports.decimation import decimated
 from pipelines.exports.mesh import Floats, TriangleMesh, joined
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
+from pipelines.tools.process import Program
 
 _LEAST_PIECE = 200
 """Faces; what is smaller is reduced together with its like."""
-_OVERSHOOT = 1.02
+LARGE = 300_000
+"""Faces of a piece that has a process of its own."""
+_USUAL_S, _TELL_S = 6e-6, 1.0
+"""How long a face takes, for what is told while nobody knows how far it is; how often to tell."""
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
 _core: Any = open3d.core
 _tensor_geometry: Any = open3d.t.geometry
 
 
-def reduced(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
+def reduced(
+    mesh: TriangleMesh,
+    triangles: int,
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> TriangleMesh:
     """The mesh with so many triangles; one that has no more stays as it is.
 
-    A few more remain where no edge can be taken away without turning a triangle over.
+    A few more remain where no edge can be taken away without turning a triangle over. on_progress:
+    told a share that rises, every second also within a large piece; what it raises ends the work.
     """
     total = len(mesh.faces)
     if total <= triangles:
         return mesh
     piece = _pieces(mesh)
-    shares = np.floor(np.bincount(piece) * (triangles / total)).astype(int)
-    parts = [
-        _fewer(mesh.with_faces(mesh.faces[piece == index]), int(share))
-        for index, share in enumerate(shares)
-    ]
+    sizes = np.bincount(piece)
+    shares = np.floor(sizes * (triangles / total)).astype(int)
+    before = np.cumsum(sizes) - sizes
+    parts = []
+    for index, share in enumerate(shares):
+
+        def on_part(done: float, first: int = before[index], size: int = sizes[index]) -> None:
+            on_progress((first + size * done) / total)
+
+        parts.append(_fewer(mesh.with_faces(mesh.faces[piece == index]), int(share), on_part))
+        on_part(1.0)
     return joined([part for part in parts if len(part.faces)])
 
 
-def _fewer(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
+def _fewer(
+    mesh: TriangleMesh, triangles: int, on_progress: Callable[[float], None]
+) -> TriangleMesh:
     """One piece with so many triangles, its colours where they were."""
     origin = mesh.vertices.mean(axis=0)
     # The errors that pyfqmr allows, more with each round, are those of a mesh of size 1.
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))) or 1.0
     local = (mesh.vertices - origin) / size
-    for keep_borders in (True, False):
-        program = pyfqmr.Simplify()
-        program.setMesh(local, mesh.faces)
-        program.simplify_mesh(triangles, preserve_border=keep_borders, verbose=False)
-        vertices, faces, _ = program.getMesh()
-        if len(faces) <= _OVERSHOOT * triangles:
-            break
-    faces = np.asarray(faces, np.int32).reshape(-1, 3)
-    vertices = np.asarray(vertices, np.float64)
+    if len(mesh.faces) < LARGE:
+        vertices, faces = decimated(local, mesh.faces, triangles)
+    else:
+        vertices, faces = _elsewhere(local, mesh.faces, triangles, on_progress)
     made = TriangleMesh(
         vertices * size + origin, faces, _colors_at(mesh, local, vertices), np.zeros_like(vertices)
     )
     return from_open3d(to_open3d(made, origin), origin)
+
+
+def _elsewhere(
+    vertices: Floats,
+    faces: NDArray[np.int32],
+    triangles: int,
+    on_progress: Callable[[float], None],
+) -> tuple[Floats, NDArray[np.int32]]:
+    """`decimated` in a process of its own, which ends with whatever on_progress raises.
+
+    Raises ToolError where it fails.
+    """
+    begun = told = time.monotonic()
+    usual_s = _USUAL_S * len(faces)
+
+    def wait() -> bool:
+        nonlocal told
+        if (now := time.monotonic()) - told >= _TELL_S:
+            told = now
+            on_progress((now - begun) / (now - begun + usual_s))
+        return False
+
+    with tempfile.TemporaryDirectory(prefix="decimation-") as name:
+        folder = Path(name)
+        np.savez(folder / decimation.INPUT, vertices=vertices, faces=faces, triangles=triangles)
+        # -P: the modules beside the script are no modules of the programs that it uses.
+        command = [sys.executable, "-P", decimation.__file__, name]
+        with Program(command, is_cancelled=wait) as program:
+            program.wait()
+        with np.load(folder / decimation.OUTPUT) as fewer:
+            return fewer["vertices"], fewer["faces"]
 
 
 def _colors_at(mesh: TriangleMesh, local: Floats, points: Floats) -> Floats:

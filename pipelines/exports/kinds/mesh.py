@@ -24,6 +24,7 @@ from pipelines.stage import Artifact, StageContext
 if TYPE_CHECKING:
     from pipelines.exports.formats.glb import GlbStyle
     from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+    from pipelines.exports.surface.shells import Shell
     from pipelines.scene.cameras_file import Intrinsics
     from pipelines.scene.trained_scene import TrainedScene
 
@@ -36,7 +37,8 @@ _FILES: dict[Format, str] = {
     "stl": "mesh.stl",
     "usdz": "mesh.usdz",
 }
-_RENDER_SHARE, _FUSE_SHARE, _REFINE_SHARE, _TEXTURE_SHARE = 0.5, 0.65, 0.85, 0.97
+_RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
+_REFINE_SHARE, _REDUCE_SHARE, _TEXTURE_SHARE = 0.83, 0.86, 0.97
 _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 """Photos that refine the mesh are so long, or shorter where all of them would have more pixels."""
 
@@ -57,7 +59,11 @@ class MeshOptions(CropOptions, TextureOptions):
     )
 
     resolution: int = Field(
-        256, ge=32, le=2048, description="Voxels along the longest side of the subject."
+        256,
+        ge=32,
+        le=2048,
+        description="Voxels along the longest side of the subject; fewer where memory has no room "
+        "for so many, which the report tells.",
     )
     num_views: int = Field(
         0, ge=0, le=5000, description="Training views fused, evenly picked; 0 for all."
@@ -131,7 +137,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.placement import placement_of
     from pipelines.exports.reduction import reduced
     from pipelines.exports.surface.refinement import refined
-    from pipelines.exports.surface.shells import Shell, find_shells, fuse_shells
+    from pipelines.exports.surface.shells import Shell, affordable, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
     from pipelines.exports.texture.bake import painted
     from pipelines.scene.depth_views import Pinhole
@@ -158,13 +164,20 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
         lenses = [Pinhole.of(scene.lens_of(image), options.render_long_side_px) for image in images]
         store = render_views(scene, images, lenses, Path(folder), ctx, _RENDER_SHARE, known)
+        asked, shells = (
+            shells,
+            affordable(
+                store, shells, _part_of(ctx, "looking for surfaces", _RENDER_SHARE, _AFFORD_SHARE)
+            ),
+        )
+        coarser = _coarser(asked, shells)
+        if coarser is not None:
+            ctx.logger.warning("The mesh is coarser than asked for: %s", coarser["reason"])
         mesh = fuse_shells(
             store,
             shells,
             options.max_faces,
-            lambda done: ctx.progress(
-                _RENDER_SHARE + (_FUSE_SHARE - _RENDER_SHARE) * done, "fusing depth", None
-            ),
+            _part_of(ctx, "fusing depth", _AFFORD_SHARE, _FUSE_SHARE),
         )
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
@@ -178,9 +191,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         mesh = refined(
             mesh,
             photos,
-            lambda done: ctx.progress(
-                _FUSE_SHARE + (_REFINE_SHARE - _FUSE_SHARE) * done, "refining", None
-            ),
+            _part_of(ctx, "refining", _FUSE_SHARE, _REFINE_SHARE),
             flat=options.flatten,
         )
         del photos
@@ -188,9 +199,10 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     if crop is not None and len(mesh.faces) == 0:
         raise empty_crop(crop, whole.vertices, "mesh")
     if options.triangles:
-        ctx.progress(_REFINE_SHARE, f"reducing {len(mesh.faces)} triangles")
-        mesh = reduced(mesh, options.triangles)
-    each = (_TEXTURE_SHARE - _REFINE_SHARE) / (1 + options.lods)
+        told = _part_of(ctx, f"reducing {len(mesh.faces)} triangles", _REFINE_SHARE, _REDUCE_SHARE)
+        told(0.0)
+        mesh = reduced(mesh, options.triangles, told)
+    each = (_TEXTURE_SHARE - _REDUCE_SHARE) / (1 + options.lods)
 
     def paint(shape: TriangleMesh, level: int) -> TriangleMesh | TexturedMesh:
         side = texture_px_of(level, options.texture_px)
@@ -200,12 +212,17 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             [scene.lens_of(image) for image in shown],
             options.model_copy(update={"texture_px": side}),
             ctx,
-            (_REFINE_SHARE + each * level, _REFINE_SHARE + each * (level + 1)),
+            (_REDUCE_SHARE + each * (level + 0.1), _REDUCE_SHARE + each * (level + 1)),
         )
 
     skin = paint(mesh, 0)
-    levels = []
-    for level, shape in enumerate(levels_of(mesh, options.lods), start=1):
+    levels: list[dict[str, Any]] = []
+
+    def on_level(done: float) -> None:
+        begin = _REDUCE_SHARE + each * (len(levels) + 1)
+        ctx.progress(begin + 0.1 * each * done, "reducing for a coarser level")
+
+    for level, shape in enumerate(levels_of(mesh, options.lods, on_level), start=1):
         coarse, path = paint(shape, level), ctx.out / f"mesh-lod{level}.glb"
         glb.write_mesh(path, place.mesh(coarse), frame, style_of(options))
         levels.append({"file": path.name, **_told(coarse)})
@@ -219,10 +236,29 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         "levels": levels,
         "num_views": len(images),
         "voxel": round(shells[0].voxel, 9),
+        "coarser": coarser,
         "bounds": shells[0].bounds.as_dict(),
         "shells": [
             {"voxel": round(shell.voxel, 9), **shell.bounds.as_dict()} for shell in shells[1:]
         ],
+    }
+
+
+def _part_of(ctx: StageContext, message: str, begin: float, end: float) -> Callable[[float], None]:
+    """What tells the share that is done of a part of the export."""
+    return lambda done: ctx.progress(begin + (end - begin) * done, message, None)
+
+
+def _coarser(asked: Sequence[Shell], made: Sequence[Shell]) -> dict[str, Any] | None:
+    """What the report says where memory has no room for voxels as fine as asked for."""
+    grown = [(one.voxel, two.voxel) for one, two in zip(asked, made, strict=True)]
+    if all(wanted == found for wanted, found in grown):
+        return None
+    return {
+        "asked_voxel": round(asked[0].voxel, 9),
+        "reason": f"{len([one for one in grown if one[0] != one[1]])} of {len(grown)} parts of the "
+        "scene would not fit into memory with voxels of mesh.resolution; crop, or lower "
+        "mesh.far_distance, for finer ones.",
     }
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.surface.clean import clean
-from pipelines.exports.surface.tsdf import fuse
+from pipelines.exports.surface.tsdf import Blocks, affordable_blocks, fuse
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.depth_views import ViewStore
 
@@ -19,14 +19,16 @@ REACH = 3.0
 _MIN_GROWTH = 1.2
 """What is hardly larger than the shell in it shows nothing new and is left out."""
 _OUTER_FACES = 0.25
+_FUSE_SHARE = 0.75
 
 
 @dataclass(frozen=True)
 class Shell:
-    """bounds: with all that inner shells have. voxel: world units."""
+    """bounds: with all that inner shells have. voxel: world units. blocks: where they are known."""
 
     bounds: SceneBounds
     voxel: float
+    blocks: Blocks | None = None
 
 
 def find_shells(
@@ -53,6 +55,27 @@ def find_shells(
     return shells
 
 
+def affordable(
+    views: ViewStore,
+    shells: Sequence[Shell],
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> list[Shell]:
+    """The shells with voxels that memory has room for (`tsdf.affordable_blocks`).
+
+    on_progress: told the share that is done; may raise.
+    """
+    made = []
+    for index, shell in enumerate(shells):
+
+        def on_share(done: float, before: int = index) -> None:
+            on_progress((before + done) / len(shells))
+
+        voxel, blocks = affordable_blocks(views, shell.bounds, shell.voxel, on_share)
+        made.append(replace(shell, voxel=voxel, blocks=blocks))
+        on_share(1.0)
+    return made
+
+
 def fuse_shells(
     views: ViewStore,
     shells: Sequence[Shell],
@@ -62,19 +85,23 @@ def fuse_shells(
     """All shells fused and cleaned, as one mesh; may be without vertices.
 
     max_faces: of the innermost shell; each other one has at most a quarter of it. on_progress: told
-    the share of the views fused so far; may raise.
+    the share that is done; may raise.
     """
     pieces = []
     for index, shell in enumerate(shells):
 
-        def on_view(done: int, before: int = index) -> None:
-            on_progress((before + done / len(views)) / len(shells))
+        def on_fused(done: float, before: int = index) -> None:
+            on_progress((before + _FUSE_SHARE * done) / len(shells))
 
-        fused = fuse(views, shell.bounds, shell.voxel, on_view)
+        def on_cleaned(done: float, before: int = index) -> None:
+            on_progress((before + _FUSE_SHARE + (1.0 - _FUSE_SHARE) * done) / len(shells))
+
+        fused = fuse(views, shell.bounds, shell.voxel, on_fused, shell.blocks)
         if index:
             fused = _outside(fused, shells[index - 1].bounds, shell.voxel)
         faces = max_faces if index == 0 else max(100, int(_OUTER_FACES * max_faces))
-        pieces.append(clean(fused, shell.bounds, faces))
+        pieces.append(clean(fused, shell.bounds, faces, on_cleaned))
+        on_cleaned(1.0)
     return joined([piece for piece in pieces if len(piece.faces)])
 
 

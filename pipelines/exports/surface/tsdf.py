@@ -12,8 +12,8 @@ truncation, which is our pixel centre at +0.5.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
 
 import numpy as np
 import open3d
@@ -25,6 +25,8 @@ from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.depth_views import DepthView
 
 Floats = NDArray[np.float64]
+Blocks = NDArray[np.int32]
+"""[B, 3], coordinates of blocks of voxels."""
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
 _core: Any = open3d.core
@@ -35,33 +37,94 @@ _NOTHING_TOUCHED = "No block is touched"
 _TRUNCATION_VOXELS = 5.0
 _MIN_VIEWS = 2
 """A surface that one view alone shows is not believed."""
+MOST_BLOCKS = 80_000
+"""Blocks of voxels for which there is room, each with about 30 KB until the mesh is done."""
+_MANY, _COARSER = 4, 1.05
+_FIND_SHARE, _EXTRACT_SHARE = 0.25, 0.95
 
 
-def fuse(
-    views: Iterable[DepthView],
+class Sized(Protocol):
+    """Depth views that can be counted and iterated more than once: a list, a store on disk."""
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[DepthView]: ...
+
+
+def affordable_blocks(
+    views: Sized,
     bounds: SceneBounds,
     voxel: float,
-    on_view: Callable[[int], None] = lambda done: None,
-) -> TriangleMesh:
-    """Fuse depth views into a mesh.
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> tuple[float, Blocks | None]:
+    """The voxel's side, or a larger one with which no more than `MOST_BLOCKS` are fused, and those.
 
-    views: can be iterated more than once. bounds: where surface is wanted. voxel: side of a voxel,
-    world units. on_view: told the number of views fused so far; may raise.
-    Returns a mesh without vertices where the views show no surface inside the bounds.
+    Where the whole box has no more, no view is looked at, and the blocks are None. on_progress: as
+    of `fuse`.
     """
-    origin = (bounds.box_min + bounds.box_max) / 2.0
-    grid = _tensor_geometry.VoxelBlockGrid(
+    origin, left = (bounds.box_min + bounds.box_max) / 2.0, 1.0
+    while _blocks_of_box(bounds, voxel) > MOST_BLOCKS:
+
+        def on_share(done: float, before: float = left) -> None:
+            on_progress(1.0 - before + 0.5 * before * done)
+
+        most, grid = _MANY * MOST_BLOCKS, _grid(voxel, 1)
+        blocks = _blocks_near_surface(grid, views, bounds, origin, on_share, most)
+        if len(blocks) <= MOST_BLOCKS:
+            return voxel, blocks
+        # Surfaces have as many blocks as the square of what the voxels are finer.
+        voxel *= max(_COARSER, float(np.sqrt(len(blocks) / MOST_BLOCKS)))
+        left *= 0.5
+    return voxel, None
+
+
+def _blocks_of_box(bounds: SceneBounds, voxel: float) -> float:
+    """As many blocks as the box could touch, with those that reach into it from outside."""
+    sides = (
+        (bounds.box_max - bounds.box_min) / (voxel * _BLOCK)
+        + 2.0
+        + 2.0 * _TRUNCATION_VOXELS / _BLOCK
+    )
+    return float(np.prod(np.ceil(sides)))
+
+
+def _grid(voxel: float, num_blocks: int) -> Any:
+    """Open3D's grid with room for so many blocks; it takes a larger copy where it needs more."""
+    return _tensor_geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight", "color"),
         attr_dtypes=(_core.float32, _core.float32, _core.float32),
         attr_channels=((1), (1), (3)),
         voxel_size=voxel,
         block_resolution=_BLOCK,
-        block_count=10_000,
+        block_count=num_blocks,
         device=_core.Device("CPU:0"),
     )
-    blocks = _blocks_near_surface(grid, views, bounds, origin)
+
+
+def fuse(
+    views: Sized,
+    bounds: SceneBounds,
+    voxel: float,
+    on_progress: Callable[[float], None] = lambda done: None,
+    blocks: Blocks | None = None,
+) -> TriangleMesh:
+    """Fuse depth views into a mesh.
+
+    views: are iterated twice. bounds: where surface is wanted. voxel: side of a voxel, world units.
+    on_progress: told the share that is done; may raise. blocks: where `affordable_blocks` found
+    them for that voxel.
+    Returns a mesh without vertices where the views show no surface inside the bounds.
+    """
+    origin = (bounds.box_min + bounds.box_max) / 2.0
+
+    def on_found(done: float) -> None:
+        on_progress(_FIND_SHARE * done)
+
+    if blocks is None:
+        blocks = _blocks_near_surface(_grid(voxel, 1), views, bounds, origin, on_found)
     if len(blocks) == 0:
         return empty_mesh()
+    grid = _grid(voxel, len(blocks))
     keys = _core.Tensor(blocks)
     for done, view in enumerate(views, start=1):
         depth = np.where(view.smooth_mask(), view.z_depth, 0.0).astype(np.float32)
@@ -78,12 +141,13 @@ def fuse(
             _farthest(view),
             _TRUNCATION_VOXELS,
         )
-        on_view(done)
+        on_progress(_FIND_SHARE + (_EXTRACT_SHARE - _FIND_SHARE) * done / len(views))
     # Open3D keeps voxels whose weight, the number of views, is above its threshold.
-    extracted = grid.extract_triangle_mesh(_MIN_VIEWS - 0.5).to_legacy()
-    # Its threads number vertices and faces as they come to them, another way in each run.
     nowhere = np.zeros(3)
-    return from_open3d(to_open3d(ordered(from_open3d(extracted, nowhere)), nowhere), origin)
+    made = from_open3d(grid.extract_triangle_mesh(_MIN_VIEWS - 0.5).to_legacy(), nowhere)
+    del grid, keys  # the field is larger than all that follows
+    # Its threads number vertices and faces as they come to them, another way in each run.
+    return from_open3d(to_open3d(ordered(made), nowhere), origin)
 
 
 def _farthest(view: DepthView) -> float:
@@ -92,11 +156,22 @@ def _farthest(view: DepthView) -> float:
 
 
 def _blocks_near_surface(
-    grid: Any, views: Iterable[DepthView], bounds: SceneBounds, origin: Floats
-) -> NDArray[np.int32]:
-    """Coordinates [B, 3] of the blocks that any view's surface inside the bounds touches."""
+    grid: Any,
+    views: Sized,
+    bounds: SceneBounds,
+    origin: Floats,
+    on_progress: Callable[[float], None] = lambda done: None,
+    at_most: float = np.inf,
+) -> Blocks:
+    """Coordinates [B, 3] of the blocks that any view's surface inside the bounds touches.
+
+    at_most: where there are more the rest is not looked for.
+    """
     found: set[tuple[int, int, int]] = set()
-    for view in views:
+    for done, view in enumerate(views):
+        on_progress(done / len(views))
+        if len(found) > at_most:
+            break
         wanted = bounds.mask(view)
         if not wanted.any():
             continue

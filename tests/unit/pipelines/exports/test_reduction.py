@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,8 @@ import open3d
 import pytest
 from scipy.spatial import cKDTree
 
+from pipelines.errors import Cancelled, ToolError
+from pipelines.exports import decimation, reduction
 from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.reduction import reduced
 
@@ -110,3 +114,51 @@ def test_many_small_pieces_are_reduced_together() -> None:
 def test_a_mesh_that_is_small_enough_stays_as_it_is() -> None:
     mesh = sheet(10)
     assert reduced(mesh, len(mesh.faces)) is mesh
+
+
+def test_a_large_piece_is_reduced_elsewhere_to_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = joined([sheet(), ball(_FAR, 1.0, 20)])
+    here = reduced(mesh, len(mesh.faces) // 10)
+    monkeypatch.setattr(reduction, "LARGE", 1000)
+    told: list[float] = []
+    elsewhere = reduced(mesh, len(mesh.faces) // 10, told.append)
+    for name in ("vertices", "faces", "colors", "normals"):
+        np.testing.assert_array_equal(getattr(elsewhere, name), getattr(here, name))
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_a_long_reduction_is_told_of_and_can_be_cancelled(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A program that never ends in place of one that takes minutes."""
+    script, pid = tmp_path / "endless.py", tmp_path / "pid"
+    script.write_text(
+        f"import os, time\nopen({str(pid)!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)\n"
+    )
+    monkeypatch.setattr(decimation, "__file__", str(script))
+    monkeypatch.setattr(reduction, "LARGE", 1000)
+    told: list[float] = []
+
+    def tell(done: float) -> None:
+        told.append(done)
+        if len(told) > 2 and pid.exists() and pid.read_text():
+            raise Cancelled("Nobody wants it any more.")
+
+    with pytest.raises(Cancelled):
+        reduced(sheet(), 500, tell)
+    assert sorted(set(told)) == told, "it moves"
+    assert 0.0 < told[0] < told[-1] < 1.0
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
+
+
+def test_a_reduction_that_fails_elsewhere_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    script = tmp_path / "broken.py"
+    script.write_text("raise MemoryError('no room')")
+    monkeypatch.setattr(decimation, "__file__", str(script))
+    monkeypatch.setattr(reduction, "LARGE", 1000)
+    with pytest.raises(ToolError, match="no room"):
+        reduced(sheet(), 500)

@@ -13,6 +13,7 @@ from pipelines.errors import Cancelled, ExportError
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh
+from pipelines.exports.surface import tsdf
 from pipelines.exports.texture import charts
 from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
@@ -135,3 +136,16 @@ def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -
     artifacts = {artifact.name for artifact in get_stage("mesh").artifacts}
     assert {path.name for path in job.stage("mesh").glob("*.glb")} <= artifacts
     assert not (job.stage("mesh") / "mesh-lod3.glb").exists()
+
+
+def test_a_mesh_for_which_memory_has_no_room_is_coarser_and_says_so(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fine = tiny_job.run(job, "mesh", refine="none", texture="none")["summary"]
+    assert fine["coarser"] is None
+    monkeypatch.setattr(tsdf, "MOST_BLOCKS", 100)
+    coarse = tiny_job.run(job, "mesh", refine="none", texture="none")["summary"]
+    assert coarse["coarser"]["asked_voxel"] == fine["voxel"]
+    assert coarse["voxel"] > 1.2 * fine["voxel"]
+    assert "mesh.resolution" in coarse["coarser"]["reason"]
+    assert coarse["num_faces"] < fine["num_faces"]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.surface import tsdf
 from pipelines.exports.surface.clean import clean
-from pipelines.exports.surface.tsdf import fuse
+from pipelines.exports.surface.tsdf import affordable_blocks, fuse
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.depth_views import DepthView, Pinhole, ViewStore, z_depth_of
@@ -165,3 +166,33 @@ def test_an_undistorted_lens_keeps_the_field_of_view_and_cuts_a_fisheye() -> Non
     assert lens.cx / lens.width == pytest.approx(545.0 / 1080.0)
     fisheye = Pinhole.of(Intrinsics(1000, 1000, 300.0, 300.0, 500, 500, "OPENCV_FISHEYE"), 500)
     assert 2 * np.degrees(np.arctan(250 / fisheye.fl_x)) == pytest.approx(110.0)
+
+
+def test_voxels_are_as_large_as_memory_wants_and_no_larger(
+    views: list[DepthView], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bounds, fine = bounds_around(CENTER), 2.6 / 256
+
+    def num_blocks(voxel: float) -> int:
+        grid, origin = tsdf._grid(voxel, 1), (bounds.box_min + bounds.box_max) / 2.0
+        return len(tsdf._blocks_near_surface(grid, views, bounds, origin))
+
+    everything = num_blocks(fine)
+    assert everything > 2000
+    monkeypatch.setattr(tsdf, "MOST_BLOCKS", everything)
+    same, blocks = affordable_blocks(views, bounds, fine)
+    assert blocks is not None
+    assert (same, len(blocks)) == (fine, everything)
+    monkeypatch.setattr(tsdf, "MOST_BLOCKS", 600)
+    told: list[float] = []
+    found, blocks = affordable_blocks(views, bounds, fine, told.append)
+    assert blocks is not None
+    assert 200 < len(blocks) == num_blocks(found) <= 600
+    known, looked = (fuse(views, bounds, found, blocks=given) for given in (blocks, None))
+    np.testing.assert_array_equal(known.vertices, looked.vertices)
+    assert told == sorted(told)
+    assert 0.0 <= told[0] < told[-1] < 1.0
+
+
+def test_a_box_that_fits_as_a_whole_needs_no_look() -> None:
+    assert affordable_blocks([], bounds_around(CENTER), 2.6 / 256) == (2.6 / 256, None)
