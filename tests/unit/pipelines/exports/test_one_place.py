@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,9 +17,13 @@ import trimesh
 from PIL import Image
 from pxr import Usd, UsdGeom
 
+from pipelines.exports.formats import glb
 from pipelines.exports.formats.ply import read_ply
+from pipelines.exports.frame import back_to_world
+from pipelines.nerf.training.checkpoint import DESCRIPTION_NAME
 from pipelines.workspace import Workspace
 from tests.gltf_validator import problems_of
+from tests.unit.pipelines.exports.test_placement import MOVED
 from tests.unit.pipelines.stages import tiny_job
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
@@ -85,18 +90,28 @@ def test_all_meshes_have_the_same_bounds_in_other_programs(job: Workspace, up: s
             assert off < summary["voxel"], f"{name} by {read.__name__} is {off:g} off"
 
 
+@pytest.mark.parametrize("frame", ["gravity", "source"])
 def test_the_meshs_surface_the_cloud_and_the_cameras_are_where_the_photos_saw_them(
-    job: Workspace, tmp_path: Path
+    job: Workspace, tmp_path: Path, frame: str
 ) -> None:
+    _came_from_another_world(job)
     for stage in ("mesh", "pointcloud", "cameras"):
-        tiny_job.run(job, stage)
+        summary = tiny_job.run(job, stage, frame=frame)["summary"]
+        assert (summary["frame"]["name"], summary["frame"]["metric"]) == (frame, frame == "gravity")
     mesh = open3d.t.io.read_triangle_mesh(str(job.stage("mesh") / "mesh.ply"))
     caster: Any = open3d.t.geometry.RaycastingScene()
     caster.add_triangles(mesh)
     cloud = read_ply(job.stage("pointcloud") / "pointcloud.ply")
     points = cloud.points.astype(np.float64)
-    away = caster.compute_distance(_core.Tensor(cloud.points)).numpy()
+    away = caster.compute_distance(_core.Tensor(points.astype(np.float32))).numpy()
     assert np.median(away) < 0.01 * float(np.linalg.norm(np.ptp(points, axis=0)))
+    # What reads the mesh back finds it in the world of cameras.json, whatever the frame.
+    read = glb.read_mesh(job.stage("mesh") / "mesh.glb").vertices
+    back = back_to_world(read_ply(job.stage("mesh") / "mesh.ply").points, cloud.from_world)
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(read, axis=0), end(back, axis=0), atol=1e-4)
+    own = summary["frame"]["from_world"]
+    assert cloud.from_world is None or cloud.from_world.tolist() == own
     with zipfile.ZipFile(job.stage("cameras") / "colmap.zip") as archive:
         archive.extractall(tmp_path / "colmap")
     model: Any = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
@@ -123,3 +138,16 @@ def test_the_meshs_surface_the_cloud_and_the_cameras_are_where_the_photos_saw_th
             np.abs(photo[at[:, 0] % lens.height, at[:, 1] % lens.width] - wanted).mean()
         )
     assert np.mean(off) < 0.5 * np.mean(by_chance), (np.mean(off), np.mean(by_chance))
+
+
+def _came_from_another_world(job: Workspace) -> None:
+    """As if the capture's own world had been turned, moved and scaled into the one of the job."""
+    path = job.stage("train") / "model.zip"
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    description = json.loads(files[DESCRIPTION_NAME])
+    description["extras"]["cameras"]["notes"] = MOVED
+    files[DESCRIPTION_NAME] = json.dumps(description).encode()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)

@@ -31,8 +31,9 @@ def still(job: Workspace, **changes: Any) -> dict[str, Any]:
     return {"path": "camera_path", "camera_path": {**file, "camera_path": frames, **changes}}
 
 
-def test_the_mesh_is_seen_where_the_scene_is(job: Workspace) -> None:
-    tiny_job.run(job, "mesh", formats=("glb",))
+@pytest.mark.parametrize("frame", ["gravity", "normalised"])
+def test_the_mesh_is_seen_where_the_scene_is(job: Workspace, frame: str) -> None:
+    tiny_job.run(job, "mesh", formats=("glb",), frame=frame)
     summary = tiny_job.run(job, "meshvideo", outputs=("rgb", "mesh"), codec="png", **still(job))[
         "summary"
     ]
