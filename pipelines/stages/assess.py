@@ -1,10 +1,10 @@
 """The assess stage: the delivered mesh and cloud, seen from cameras that nothing was made from.
 
 Reads the held-out photos with their masks, the cameras of `train`, `mesh.glb` and `pointcloud.ply`
-as they are delivered, and what `evaluate` found of floaters. Where training held nothing out,
-training views take the place of held-out ones, and the result says so. Writes `assets.json` and
-`images/<name>.jpg`: photo | mesh | where there is none. Nothing is rendered from the model, no GPU
-is used.
+as they are delivered (`pipelines.exports.judged` where other formats are), and what `evaluate`
+found of floaters. Where training held nothing out, training views take the place of held-out ones,
+and the result says so. Writes `assets.json` and `images/<name>.jpg`: photo | mesh | where there is
+none. Nothing is rendered from the model, no GPU is used.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pipelines.errors import ExportError
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.exports.frame import back_to_world
+from pipelines.exports.judged import cloud_of, mesh_of
 from pipelines.exports.mesh import TexturedMesh
 from pipelines.judging.asset_scores import DEFINITIONS, mean_scores, picture_of, score_view
 from pipelines.judging.asset_views import (
@@ -91,7 +92,7 @@ def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
     caster = _caster(ctx.workspace.stage("mesh"), views.frame)
     seen = _look_at_mesh(caster, views, options, ctx)
     agreement, no_agreement = _against_agreed_depth(caster, views.frame, ctx.workspace)
-    cloud = read_ply(ctx.workspace.stage("pointcloud") / "pointcloud.ply")
+    cloud = read_ply(cloud_of(ctx.workspace.stage("pointcloud")))
     cloud_rows, spacing = _look_at_cloud(cloud, views, ctx)
     mesh_means, floaters = mean_scores(seen.rows), _floaters(ctx.workspace)
     warning = geometry_warning(
@@ -177,7 +178,7 @@ class _Seen:
 
 def _caster(folder: Path, frame: SceneTransform) -> MeshCaster:
     """The mesh as it is delivered, back from its frame: with its texture, where it has one."""
-    mesh = read_mesh(folder / "mesh.glb")
+    mesh = read_mesh(mesh_of(folder))
     vertices = frame.scene_from_world(mesh.vertices)
     if isinstance(mesh, TexturedMesh):
         return MeshCaster(vertices, mesh.faces, Texture(mesh.uv, mesh.texture))

@@ -50,8 +50,8 @@ class MeshOptions(CropOptions, TextureOptions):
         ("glb", "ply"),
         min_length=1,
         max_length=5,
-        description="Files that are written: glb, ply, obj (a zip with its material and picture), "
-        "stl, usdz. glb must be among them: the job's assessment looks at it.",
+        description="Files that are delivered: glb, ply, obj (a zip with its material and "
+        "picture), stl, usdz.",
     )
     up_axis: Axis = Field(
         "z",
@@ -99,9 +99,9 @@ class MeshOptions(CropOptions, TextureOptions):
         0,
         ge=0,
         le=3,
-        description="Levels of detail beside mesh.glb: mesh-lod1.glb has a quarter of its "
-        "triangles, mesh-lod2.glb a sixteenth, mesh-lod3.glb a sixty-fourth, each with a texture "
-        "of half the side.",
+        description="Levels of detail, glb whatever the formats: mesh-lod1.glb has a quarter of "
+        "the mesh's triangles, mesh-lod2.glb a sixteenth, mesh-lod3.glb a sixty-fourth, each with "
+        "a texture of half the side.",
     )
 
     glb_unlit: bool = Field(
@@ -118,9 +118,7 @@ class MeshOptions(CropOptions, TextureOptions):
 
     @field_validator("formats")
     @classmethod
-    def _each_once_and_glb(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:
-        if "glb" not in formats:
-            raise ValueError("must have glb among them")
+    def _each_once(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:
         return tuple(dict.fromkeys(formats))
 
 
@@ -294,6 +292,7 @@ def _write(
 ) -> None:
     """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
     from pipelines.exports.formats import glb, obj, ply, stl, usdz
+    from pipelines.exports.judged import JUDGED_MESH
 
     writers: dict[Format, Callable[[Path], None]] = {
         "glb": lambda path: glb.write_mesh(path, skin, frame, style_of(options)),
@@ -305,6 +304,8 @@ def _write(
     for name in options.formats:
         ctx.check_cancelled()
         writers[name](ctx.out / _FILES[name])
+    if "glb" not in options.formats:
+        writers["glb"](ctx.out / JUDGED_MESH)
 
 
 def _empty(why: str) -> ExportError:

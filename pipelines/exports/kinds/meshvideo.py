@@ -52,10 +52,11 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     # Imported where it runs: the API reads this file too.
     from pipelines.exports.filming import Film, make_film
     from pipelines.exports.formats.glb import read_mesh
+    from pipelines.exports.judged import mesh_of
     from pipelines.exports.paths.flight import make_path, typical_lens
     from pipelines.exports.shots import Lens, MeshStudio
 
-    path = ctx.workspace.stage("mesh") / "mesh.glb"
+    path = mesh_of(ctx.workspace.stage("mesh"))
     if not path.is_file():
         raise ExportError(
             "The job has no mesh to film.",

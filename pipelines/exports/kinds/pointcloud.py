@@ -53,8 +53,8 @@ class PointcloudOptions(CropOptions):
         ("ply",),
         min_length=1,
         max_length=5,
-        description="Files that are written: ply, las, laz, xyz (text), colmap (a model with the "
-        "points and the cameras). ply must be among them: the job's assessment looks at it.",
+        description="Files that are delivered: ply, las, laz, xyz (text), colmap (a model with the "
+        "points and the cameras).",
     )
     num_points: int = Field(1_000_000, ge=1000, le=50_000_000, description="Points wanted.")
     spacing: float = Field(
@@ -68,9 +68,7 @@ class PointcloudOptions(CropOptions):
 
     @field_validator("formats")
     @classmethod
-    def _each_once_and_ply(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:
-        if "ply" not in formats:
-            raise ValueError("must have ply among them")
+    def _each_once(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:
         return tuple(dict.fromkeys(formats))
 
 
@@ -157,6 +155,7 @@ def _write(
     """The files. normals: [P, 3]."""
     from pipelines.exports.formats import las, ply, xyz
     from pipelines.exports.formats.colmap import write_colmap_points
+    from pipelines.exports.judged import JUDGED_CLOUD
 
     points, cameras = place.points(cloud.points), place.cameras(cameras)
     content = (points, cloud.colors, place.directions(normals), place.frame())
@@ -172,6 +171,8 @@ def _write(
     for name in options.formats:
         ctx.check_cancelled()
         writers[name](ctx.out / _FILES[name])
+    if "ply" not in options.formats:
+        writers["ply"](ctx.out / JUDGED_CLOUD)
 
 
 def _empty(why: str) -> ExportError:

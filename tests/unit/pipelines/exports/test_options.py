@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipelines.exports.options import RenderingOptions, render_config
+from pipelines.exports.requests import resolve_export
 from pipelines.nerf.options.render import RenderConfig
 from pipelines.options import OptionsError, evaluate_config, resolve_options, stage_options
 
@@ -49,13 +50,29 @@ def test_wrong_values_are_refused_with_their_path(wrong: dict[str, object]) -> N
 
 
 @pytest.mark.parametrize(
+    ("kind", "formats", "kept"),
+    [
+        ("mesh", ["stl"], ["stl"]),
+        ("mesh", ["usdz", "obj", "usdz"], ["usdz", "obj"]),
+        ("pointcloud", ["laz"], ["laz"]),
+        ("pointcloud", ["colmap", "xyz"], ["colmap", "xyz"]),
+    ],
+)
+def test_an_export_has_exactly_the_formats_asked_for(
+    kind: str, formats: list[str], kept: list[str]
+) -> None:
+    own = resolve_options("preview", {})[kind]
+    assert resolve_export(kind, "preview", own, {"formats": formats})["formats"] == kept
+    assert resolve_options("preview", {kind: {"formats": formats}})[kind]["formats"] == kept
+
+
+@pytest.mark.parametrize(
     ("stage", "wrong", "told"),
     [
-        ("mesh", {"formats": ["ply"]}, "must have glb among them"),
         ("mesh", {"formats": []}, "at least 1"),
         ("mesh", {"formats": ["glb", "fbx"]}, "'glb', 'ply', 'obj', 'stl' or 'usdz'"),
         ("mesh", {"up_axis": "x"}, "'z' or 'y'"),
-        ("pointcloud", {"formats": ["laz"]}, "must have ply among them"),
+        ("pointcloud", {"formats": []}, "at least 1"),
         ("pointcloud", {"formats": ["ply", "e57"]}, "'las', 'laz', 'xyz' or 'colmap'"),
         ("pointcloud", {"spacing": -0.1}, "greater than or equal to 0"),
         ("mesh", {"triangles": -1}, "greater than or equal to 0"),

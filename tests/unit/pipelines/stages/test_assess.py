@@ -43,6 +43,10 @@ def job(tmp_path: Path) -> Workspace:
     return workspace
 
 
+_SPECK = (1e-3 * np.eye(3), np.array([[0, 1, 2]], np.int32), np.eye(3), np.eye(3))
+"""A mesh of one tiny triangle."""
+
+
 def _publish(job: Workspace, stage: str) -> None:
     job.stage(stage).mkdir(exist_ok=True)
     manifest = {"stage": stage, "content": stage, "summary": {}, "timings": {"wall_s": 1.0}}
@@ -108,6 +112,19 @@ def test_the_true_surface_covers_the_photos_and_looks_like_them(job: Workspace) 
     assert len(pictures) == 2
     with Image.open(pictures[0]) as opened:
         assert opened.size == (3 * 36, 64)
+
+
+def test_assets_in_other_formats_are_judged_by_what_lies_beside_them(job: Workspace) -> None:
+    _exact_assets(job)
+    wanted = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    mesh, cloud = job.stage("mesh"), job.stage("pointcloud")
+    (mesh / "mesh.glb").rename(mesh / "judged.glb")
+    (cloud / "pointcloud.ply").rename(cloud / "judged.ply")
+    assert tiny_job.run(job, "assess", long_side_px=64)["summary"] == wanted
+    glb.write_mesh(mesh / "mesh.glb", TriangleMesh(*_SPECK))
+    assert tiny_job.run(job, "assess", long_side_px=64)["summary"] != wanted, (
+        "delivered comes first"
+    )
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,22 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
     assert files == {"mesh.ply", "mesh.glb", "manifest.json"}
 
 
+def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
+    job: Workspace,
+) -> None:
+    manifest = tiny_job.run(job, "mesh", refine="none", formats=("usdz", "stl", "usdz"))
+    assert manifest["summary"]["formats"] == ["usdz", "stl"]
+    files = {file["path"] for file in manifest["files"]}
+    artifacts = {artifact.path for artifact in get_stage("mesh").artifacts}
+    assert files & artifacts == {"mesh.usdz", "mesh.stl"}
+    assert files - artifacts == {"judged.glb"}
+    judged = read_mesh(job.stage("mesh") / "judged.glb")
+    assert isinstance(judged, TexturedMesh)
+    assert len(judged.faces) == manifest["summary"]["num_faces"]
+    film = tiny_job.run(job, "meshvideo", num_frames=8)
+    assert film["summary"]["num_frames"] == 8
+
+
 def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
     job: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

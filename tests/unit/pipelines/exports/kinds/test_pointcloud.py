@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.errors import ExportError
 from pipelines.exports.formats.ply import read_ply
+from pipelines.registry import get_stage
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
@@ -56,6 +57,19 @@ def test_all_formats_hold_the_same_points(job: Workspace, tmp_path: Path) -> Non
     np.testing.assert_allclose([point.xyz for point in points], wanted.points, atol=1e-5)
     np.testing.assert_array_equal([point.color for point in points], wanted.colors)
     assert model.num_images() == tiny_job.NUM_IMAGES
+
+
+def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
+    job: Workspace,
+) -> None:
+    manifest = tiny_job.run(job, "pointcloud", formats=("laz",))
+    files = {file["path"] for file in manifest["files"]}
+    artifacts = {artifact.path for artifact in get_stage("pointcloud").artifacts}
+    assert (files & artifacts, files - artifacts) == ({"pointcloud.laz"}, {"judged.ply"})
+    judged = read_ply(job.stage("pointcloud") / "judged.ply").points
+    np.testing.assert_allclose(
+        laspy.read(job.stage("pointcloud") / "pointcloud.laz").xyz, judged, atol=1e-5
+    )
 
 
 def _apart(points: NDArray[np.float32], least: float) -> float:
