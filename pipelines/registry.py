@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=6,
+        version=7,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",
@@ -179,7 +179,7 @@ _BY_NAME = {stage.name: stage for stage in STAGES}
 _SKIPPED: dict[Brings, frozenset[str]] = {
     "film": frozenset(),
     "photos": frozenset({"frames"}),
-    "poses": frozenset({"frames", "poses"}),
+    "poses": frozenset({"frames"}),
 }
 
 

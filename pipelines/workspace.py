@@ -7,7 +7,8 @@ JOB/
                             points.ply (posed, where sparse points came along), panoramas/ (of
                             the whole sphere: their views are in images/)
   frames/                   frames.json, images/, panoramas/ (only for videos)
-  poses/                    cameras.json, report.json, points.ply (only where no poses came)
+  poses/                    cameras.json, report.json, points.ply (posed captures: where there are
+                            points)
   depth/                    maps.json, maps/, depth.jpg, report.json
   draft/                    draft.glb, draft.jpg
   train/                    model.zip, cameras.json, previews/
@@ -87,8 +88,14 @@ class Workspace:
         return self.stage("frames" if self.is_complete("frames") else "ingest")
 
     @property
+    def brought_poses(self) -> bool:
+        """Whether the capture came with poses, be they refined since or not."""
+        return (self.stage("ingest") / "cameras.json").is_file()
+
+    @property
     def posed_cameras(self) -> Path:
-        """`cameras.json` as it enters training: from `poses`, or from the capture itself."""
+        """`cameras.json` as it enters training: from `poses`, or where a job has no such stage from
+        the capture itself."""
         return self.stage("poses" if self.is_complete("poses") else "ingest") / "cameras.json"
 
     @property

@@ -25,6 +25,7 @@ from pipelines.errors import CaptureError, ToolError
 from pipelines.options import IngestOptions
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.natural_order import natural_key
+from pipelines.scene.nearness import apart
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import CameraGroup, FeatureSettings, Reconstructor
 from pipelines.tools.colmap_results import read_matches
@@ -48,7 +49,7 @@ _SPOTS = 12
 _GAPS = (1, 3)
 _APART = 0.5
 """How far apart the two cameras of a pair should be: near enough to see the same, far enough for
-another pose to show. 1 is 30 degrees between their axes, or a quarter of the path's extent."""
+another pose to show. See `apart`."""
 
 
 @dataclass(frozen=True)
@@ -184,22 +185,11 @@ def _pairs(poses: Sequence[Floats]) -> list[Pair]:
     pairs = {(i, i + gap) for i in spots.tolist() for gap in _GAPS if i + gap < num}
     for each in poses:
         for i in spots.tolist():
-            badness = np.abs(np.log(np.maximum(_apart(each, i), 1e-9) / _APART))
+            badness = np.abs(np.log(np.maximum(apart(each, i), 1e-9) / _APART))
             badness[i] = np.inf
             j = int(badness.argmin())
             pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)
-
-
-def _apart(poses: Floats, index: int) -> Floats:
-    """How far cameras are from one of them, [N]; see _APART."""
-    centers, axes = poses[:, :, 3], poses[:, :, 2]
-    with np.errstate(over="ignore", invalid="ignore"):
-        gaps = np.linalg.norm(centers - centers[index], axis=1)
-        extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
-        angles = np.degrees(np.arccos(np.clip(axes @ axes[index], -1.0, 1.0)))
-        apart: Floats = np.hypot(angles / 30.0, 4.0 * gaps / max(extent, 1e-12))
-    return np.nan_to_num(apart)
 
 
 def _look(

@@ -38,6 +38,11 @@ CAPTURE_FAULTS = frozenset(
     }
 )
 """Errors that a capture is to blame for; others say nothing of it."""
+_OF_GIVEN: dict[str, Severity] = {
+    "given_poses_contradicted": "severe",
+    "given_poses_coarse": "moderate",
+}
+"""How grave it is that poses do not fit; that nobody could tell is a note."""
 CAPTURE_STAGES = ("ingest", "frames", "poses")
 
 SEVERE_SHARE, MODERATE_SHARE = 0.25, 0.03
@@ -85,6 +90,7 @@ def find(take: Take, thresholds: Thresholds | None = None) -> list[Finding]:
         *_too_few_placed(take, thresholds or Thresholds()),
         *_smeared(take),
         *_parallax(take),
+        *_given(take),
         *_directions(take),
         *_exposure(take),
         *_light(take),
@@ -357,6 +363,22 @@ def _exposure(take: Take) -> list[Finding]:
             tuple(found),
             {"max_ev": round(largest, 2)},
         )
+    ]
+
+
+def _given(take: Take) -> list[Finding]:
+    """Poses that came along and do not fit the pictures."""
+    if take.given is None:
+        return []
+    return [
+        Finding(
+            warning["code"],
+            _OF_GIVEN.get(warning["code"], "note"),
+            warning["message"],
+            warning["hint"],
+            measured=dict(warning["details"]),
+        )
+        for warning in take.given["warnings"]
     ]
 
 

@@ -4,7 +4,8 @@ Fixed keys: version, verdict (good, usable, poor, unusable, or null where the jo
 was known, and not for what the capture is), reasons[], advice[] (sentences, the most useful first),
 findings[] {code, severity, what, advice, spans[], measured}, error (null, or stage, code, message,
 hint), capture {kind, filename, duration_s}, pictures {num, num_placed, ratio}, lost {num, seconds,
-spans[]}, parallax_deg, metric, around (null, or covered_deg, widest_gap_deg, heights_deg,
+spans[]}, parallax_deg, metric, given_poses (null, or of poses that came along verdict, why and
+error_px, by which matches miss them), around (null, or covered_deg, widest_gap_deg, heights_deg,
 sectors[36]), timeline[] one entry a picture {file, name, time_s, placed, cause, blur_px, luma,
 speed, exposure_ev, num_features, best_matches}, path[] {file, center}. A span is {first, last} and
 of a film {from_s, to_s}. Units: pixels of a picture of 640, long sides of the picture per second,
@@ -49,6 +50,7 @@ def build_report(take: Take, thresholds: Thresholds | None = None) -> dict[str, 
         "lost": lost_of(take),
         "parallax_deg": None if take.angle_deg is None else round(take.angle_deg, 2),
         "metric": take.is_metric,
+        "given_poses": _given(take),
         "around": None
         if around is None
         else {
@@ -62,6 +64,20 @@ def build_report(take: Take, thresholds: Thresholds | None = None) -> dict[str, 
             {"file": take.shots[index].file, "center": [round(float(x), 4) for x in pose[:, 3]]}
             for index, pose in zip(take.posed, take.poses, strict=True)
         ],
+    }
+
+
+def _given(take: Take) -> dict[str, Any] | None:
+    if take.given is None:
+        return None
+    found, refinement = take.given, take.given["refinement"]
+    fit = found["sampled"]
+    if refinement is not None:
+        fit = refinement["after" if refinement["taken"] else "before"]
+    return {
+        "verdict": found["verdict"],
+        "why": found["why"],
+        "error_px": None if fit is None else fit["error_px"],
     }
 
 

@@ -65,7 +65,9 @@ class Take:
     duration_s: of the film. poses: [N, 3, 4] world_from_camera, OpenGL axes, of the pictures
     `posed` (indices into shots). points: [P, 3], colors: [P, 3] uint8. angle_deg: the median angle
     between the directions that the same point is seen from. is_metric: whether a unit is a metre;
-    None where nobody said. error: what ended the job, `{stage, code, message, hint, details}`.
+    None where nobody said. given: of poses that came along, how well they fit the pictures
+    (`pipelines.sfm.given_report`), with `warnings`. error: what ended the job, `{stage, code,
+    message, hint, details}`.
     """
 
     kind: str = ""
@@ -79,6 +81,7 @@ class Take:
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     angle_deg: float | None = None
     is_metric: bool | None = None
+    given: Mapping[str, Any] | None = None
     error: Mapping[str, Any] | None = None
 
     @property
@@ -170,6 +173,8 @@ def _with_poses(take: Take, workspace: Workspace) -> Take:
             angle_deg=report.get("median_triangulation_angle_deg"),
             is_metric=report.get("metric"),
         )
+    if report is not None and "given" in report:
+        take = replace(take, given={**report["given"], "warnings": report["warnings"]})
     if failed is not None:
         return _partly_placed(take, failed.get("placed"))
     if not workspace.posed_cameras.is_file():

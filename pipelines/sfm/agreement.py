@@ -48,17 +48,31 @@ def fitting(
     world_from_camera: [3, 4] each, OpenCV axes. places: [M, 2] each, in pixels. A place that the
     lens cannot show fits nothing; two cameras in one place fit where rays are parallel.
     """
+    near_rad = NEAR * min(np.hypot(o.width, o.height) / px_per_radian(o) for o in lenses)
+    off_rad, is_before = off_lines(world_from_camera, lenses, places)
+    return np.asarray((off_rad <= near_rad) & is_before)
+
+
+def off_lines(
+    world_from_camera: tuple[Floats, Floats],
+    lenses: tuple[Intrinsics, Intrinsics],
+    places: tuple[Floats, Floats],
+) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    """By what angle the rays of a pair's matches miss each other, [M] in radians, and whether they
+    come nearest in front of both cameras, [M], or too far away to tell.
+
+    The arguments of `fitting`. The angle is NaN for a place that the lens cannot show.
+    """
     first, second = (
         rays_through(lens, place) @ pose[:, :3].T
         for pose, lens, place in zip(world_from_camera, lenses, places, strict=True)
     )
     moved = world_from_camera[1][:, 3] - world_from_camera[0][:, 3]
     length = float(np.linalg.norm(moved))
-    near_rad = NEAR * min(np.hypot(o.width, o.height) / px_per_radian(o) for o in lenses)
     cross = np.cross(first, second)
     apart = np.linalg.norm(cross, axis=1)
     if not length > 0:
-        return np.asarray(apart <= near_rad)
+        return apart, np.ones(len(apart), bool)
     base = moved / length
     # The angle of each ray with the plane of the other and the base line, the smaller of the two.
     off = np.abs(cross @ base) / np.maximum(
@@ -72,7 +86,7 @@ def fitting(
     depth_second = (dot * along_first - along_second) / square
     before = (depth_first > 0) & (depth_second > 0)
     parallel = (apart <= _PARALLEL_RAD) & (dot > 0)
-    return np.asarray((off <= near_rad) & (before | parallel))
+    return off, before | parallel
 
 
 def _sine(rays: Floats, axis: Floats) -> Floats:

@@ -273,7 +273,7 @@ def _against_sensor(
         truth.append(depth if valid is None else np.where(valid, depth, np.float32(0.0)))
         found.append(seen[row].z_depth(views.cameras, row))
     scale = 1.0
-    if workspace.is_complete("poses"):
+    if not workspace.brought_poses:
         scale = fitted_scale(found, truth) or 1.0
         found = [scale * values for values in found]
     return {**depth_scores(found, truth), "scale": round(scale, 6)}, None

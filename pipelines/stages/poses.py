@@ -31,6 +31,7 @@ from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source, read_source
 from pipelines.sfm.subpixel import refine_model
 from pipelines.stage import StageContext
+from pipelines.stages.given_poses import run_given
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import SparseModel
 from pipelines.workspace import SPARSE_POINTS
@@ -59,9 +60,12 @@ _SUMMARY = (
 def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     """Find the poses of a capture's images. The summary is report.json without its lists of images.
 
+    Of a capture that brought its poses see `pipelines.stages.given_poses`.
     Raises PosesError (no_features, too_few_registered, no_parallax), CaptureError where there are
     no images, ToolError where COLMAP itself fails.
     """
+    if ctx.workspace.brought_poses:
+        return run_given(options, ctx)
     source = read_source(ctx.workspace)
     checkpoint = Checkpoint(ctx, source, options)
     with tempfile.TemporaryDirectory(prefix="poses-") as scratch:

@@ -161,16 +161,20 @@ def _quality(manifests: Manifests) -> dict[str, Any]:
 def _poses(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]:
     """How many images there were and how many have a pose.
 
-    With structure from motion, what it reports. Where the capture brought its poses: `num_images`
+    With structure from motion, what it reports. Where the capture brought its poses (`given` tells
+    how well they fit): `num_images`
     counts the pictures that are in the capture, with a usable pose or not; entries of its listing
     without a picture are no images and appear in the capture's details and warnings.
     """
-    if "poses" in manifests:
-        found = manifests["poses"]["summary"]
+    judged = manifests.get("poses", {}).get("summary", {})
+    if judged and "given" not in judged:
+        found = judged
         source = "structure from motion"
         num_images, num_registered = int(found["num_images"]), int(found["num_registered"])
     else:
         found, source = {"metric": capture.details.get("metric")}, "capture"
+        if judged:
+            found["given"] = judged["given"]
         if "train" in manifests:
             trained = manifests["train"]["summary"]
             num_registered = int(trained.get("num_train", 0)) + int(trained.get("num_test", 0))

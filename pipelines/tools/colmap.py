@@ -31,12 +31,15 @@ import pycolmap
 from PIL import Image
 
 from pipelines.errors import ToolError
+from pipelines.tools.colmap_adjustment import Run
 from pipelines.tools.colmap_lenses import LensTrials
 from pipelines.tools.colmap_probing import MatchedPairs, set_lens
 from pipelines.tools.colmap_results import (
+    Correspondences,
     PairStatistics,
     SparseModel,
     VerifiedMatches,
+    read_correspondences,
     read_features,
     read_matches,
     read_statistics,
@@ -295,7 +298,7 @@ class Reconstructor:
             refine_principal_point=refine_principal_point,
             num_threads=self.num_threads,
             seed=self.seed,
-            run=lambda what, call: self._run(what, call, poll),
+            run=self.runner(poll),
         )
 
     def matched(self, pairs: Sequence[tuple[int, int]]) -> MatchedPairs:
@@ -316,8 +319,16 @@ class Reconstructor:
         return StoredTracks(
             model.stored,
             num_threads=self.num_threads,
-            run=lambda what, call: self._run(what, call, poll),
+            run=self.runner(poll),
         )
+
+    def runner(self, poll: Callable[[], None]) -> Run:
+        """What runs a long call of pycolmap beside `poll`, whose errors end it."""
+        return lambda what, call: self._run(what, call, poll)
+
+    def correspondences(self) -> Correspondences:
+        """All verified matches, by features. Not while another call runs."""
+        return read_correspondences(self.database, len(self.names))
 
     def statistics(self) -> PairStatistics:
         """What extraction and matching put into the database. Not while another call runs."""
@@ -326,6 +337,12 @@ class Reconstructor:
     def verified(self, most_pairs: int, most_matches: int) -> VerifiedMatches:
         """Verified matches of some pairs, see `read_matches`. Not while another call runs."""
         return read_matches(self.database, len(self.names), most_pairs, most_matches)
+
+    def verified_of(self, pairs: Iterable[tuple[int, int]]) -> VerifiedMatches:
+        """All verified matches of these pairs. Not while another call runs."""
+        wanted = set(pairs)
+        found = read_matches(self.database, len(self.names))
+        return {pair: places for pair, places in found.items() if pair in wanted}
 
     def features(self, per_image: int) -> list[npt.NDArray[np.uint8]]:
         """Descriptors of every image, [at most per_image, 128]. Not while another call runs."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,12 +35,21 @@ def adjust(
     num_threads: int,
     refine_focal: bool = True,
     refine_principal_point: bool = False,
+    refine_distortion: bool = True,
+    loss_px: float = 1.0,
+    priors: Sequence[Any] = (),
 ) -> None:
-    """Adjust poses, points and lenses; errors beyond a pixel count less (soft L1)."""
+    """Adjust poses, points and lenses; errors beyond `loss_px` count less (soft L1).
+
+    priors: `pycolmap.PosePrior`, where images are known to be; they hold the frame then, instead of
+    two of the images.
+    """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = refine_focal
     options.refine_principal_point = refine_principal_point
+    options.refine_extra_params = refine_distortion
+    options.ceres.loss_function_scale = loss_px
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = num_threads
     options.ceres.solver_options.max_num_iterations = ends.iterations
@@ -48,9 +57,19 @@ def adjust(
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if not priors:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for _ in range(ends.rounds):
-        adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+        if priors:
+            adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+                options,
+                pycolmap.PosePriorBundleAdjustmentOptions(),
+                config,
+                list(priors),
+                reconstruction,
+            )
+        else:
+            adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
         summary = run(what, functools.partial(_solve, adjuster))
         if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
             break

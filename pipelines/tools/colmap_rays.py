@@ -16,18 +16,28 @@ def rays_through(lens: Intrinsics, places: Floats) -> Floats:
     """Unit rays [M, 3] in OpenCV camera axes through places [M, 2] in pixels; NaN where the lens
     shows nothing at a place. The eighth power of a plain lens's radius, which COLMAP has not, is
     left out."""
+    return _rays(camera_of(lens), places)
+
+
+def camera_of(lens: Intrinsics, camera_id: int = 1) -> pycolmap.Camera:
+    """A lens of ours as COLMAP's simplest camera that can express it."""
     if lens.model == PANORAMA:
         size = (lens.width, lens.height)
-        camera = pycolmap.Camera.create_from_model_name(1, PANORAMA, 1.0, *size)
-        return _rays(camera, places)
-    focals = [lens.fl_x, lens.fl_y, lens.cx, lens.cy]
-    if lens.model == "OPENCV_FISHEYE":
-        model, params = lens.model, [*focals, lens.k1, lens.k2, lens.k3, lens.k4]
-    else:
+        return pycolmap.Camera.create_from_model_name(camera_id, PANORAMA, 1.0, *size)
+    model, params = lens.model, [lens.fl_x, lens.fl_y, lens.cx, lens.cy]
+    if model == "OPENCV_FISHEYE":
+        params += [lens.k1, lens.k2, lens.k3, lens.k4]
+    elif lens.k3:
         model = "FULL_OPENCV"
-        params = [*focals, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, 0.0, 0.0, 0.0]
-    camera = pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params)
-    return _rays(camera, places)
+        params += [lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, 0.0, 0.0, 0.0]
+    elif any((lens.k1, lens.k2, lens.p1, lens.p2)):
+        model = "OPENCV"
+        params += [lens.k1, lens.k2, lens.p1, lens.p2]
+    else:
+        model = "PINHOLE"
+    return pycolmap.Camera(
+        camera_id=camera_id, model=model, width=lens.width, height=lens.height, params=params
+    )
 
 
 def px_per_radian(lens: Intrinsics) -> float:

@@ -207,6 +207,40 @@ def read_matches(
     return found
 
 
+@dataclass(frozen=True)
+class Correspondences:
+    """Which features of which images show the same, N images.
+
+    places: of each image [F, 2], where its features are, in pixels. matches: by pairs of indices,
+    [M, 2], rows of `places` in the one and the other.
+    """
+
+    places: tuple[npt.NDArray[np.float64], ...]
+    matches: dict[tuple[int, int], npt.NDArray[np.int64]]
+
+
+def read_correspondences(database: Path, num_images: int) -> Correspondences:
+    """All verified matches. Call it only while pycolmap has the database closed."""
+    places: list[npt.NDArray[np.float64]] = [np.zeros((0, 2)) for _ in range(num_images)]
+    found = {}
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        index_of = {
+            image_id: image_index(name)
+            for image_id, name in connection.execute("SELECT image_id, name FROM images")
+        }
+        for image_id, rows, columns, blob in connection.execute(
+            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
+        ):
+            values = np.frombuffer(blob, np.float32).reshape(rows, columns)
+            places[index_of[image_id]] = values[:, :2].astype(np.float64)
+        for pair_id, rows, blob in connection.execute(
+            "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0"
+        ):
+            i, j = (index_of[image] for image in pycolmap.pair_id_to_image_pair(pair_id))
+            found[i, j] = np.frombuffer(blob, np.uint32).reshape(rows, 2).astype(np.int64)
+    return Correspondences(tuple(places), found)
+
+
 def _evenly(count: int, most: int | None) -> npt.NDArray[np.int64]:
     """Indices of `count`, at most `most` of them."""
     num = count if most is None else min(count, most)

@@ -44,7 +44,7 @@ def test_a_job_skips_for_its_preset_and_for_its_capture() -> None:
     assert "views" in stages_skipped("draft", "video", {"views": {}})
     kept = set(STAGE_NAMES) - stages_skipped("draft", "video")
     assert kept == {"ingest", "frames", "poses", "check", "depth", "draft", "report"}
-    assert kept - stages_skipped("draft", "polycam") == kept - {"frames", "poses"}
+    assert kept - stages_skipped("draft", "polycam") == kept - {"frames"}
     checked = set(STAGE_NAMES) - stages_skipped("check", "video")
     assert checked == {"ingest", "frames", "poses", "check", "report"}
     with pytest.raises(KeyError):

@@ -64,7 +64,7 @@ def test_a_new_format_is_one_file_and_one_line(
     assert sniff(path, "c.zip").kind == "images"
     monkeypatch.setattr(catalogue, "IMPORTERS", (RAIL, *catalogue.IMPORTERS))
     assert sniff(path, "c.zip").kind == "rail"
-    assert skipped_stages("rail") == {"frames", "poses"}
+    assert skipped_stages("rail") == {"frames"}
     summary, ctx = ingest(tmp_path / "job", files)
     file = cameras(ctx)
     assert (summary["kind"], file.source, file.metric) == ("rail", "rail", True)
@@ -113,7 +113,7 @@ def test_every_kind_has_its_stages_and_a_reader_where_it_needs_one() -> None:
             == {
                 "film": frozenset(),
                 "photos": {"frames"},
-                "poses": {"frames", "poses"},
+                "poses": {"frames"},
             }[importer.brings]
         )
         if importer.brings != "film":

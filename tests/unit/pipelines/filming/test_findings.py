@@ -138,6 +138,24 @@ def test_light(look: Look, code: str) -> None:
     assert the_one(spoiled(good_take(), range(NUM), look=look), code)
 
 
+def given(*codes: str) -> Take:
+    """A take whose poses came along, with warnings."""
+    told = [
+        {"code": code, "message": "They do not.", "hint": "Look.", "details": {"error_px": 9.0}}
+        for code in codes
+    ]
+    return replace(good_take(), given={"warnings": told})
+
+
+def test_given_poses_that_the_pictures_contradict() -> None:
+    take = given("given_poses_contradicted")
+    assert verdict_of(take, find(take))[0] == "poor"
+    assert the_one(take, "given_poses_contradicted")
+    assert verdict_of(given(), find(given()))[0] == "good"
+    unknown = given("given_poses_unverified")
+    assert verdict_of(unknown, find(unknown))[0] == "good"
+
+
 def test_few_pictures() -> None:
     assert codes(replace(good_take(num=12), poses=ring(0), posed=())) == ["few_pictures"]
 

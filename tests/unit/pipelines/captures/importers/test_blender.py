@@ -60,7 +60,7 @@ def test_all_splits_become_one_posed_capture(tmp_path: Path) -> None:
     summary, ctx = ingest(tmp_path, blender_files(train=3, val=2, test=2))
     file = cameras(ctx)
     assert (summary["kind"], summary["num_posed"], summary["warnings"]) == ("blender", 7, [])
-    assert skipped_stages("blender") == {"frames", "poses"}
+    assert skipped_stages("blender") == {"frames"}
     assert sources(ctx)[2:4] == ["train/r_2.png", "val/r_0.png"]
     places = [[row[3] for row in image.world_from_camera] for image in file.images]
     assert places == [[n, s, 4] for s, count in enumerate((3, 2, 2)) for n in range(count)]

@@ -44,7 +44,7 @@ def test_poses_and_lens_are_those_that_were_written(tmp_path: Path, form: str, f
     assert sniff(write_zip(tmp_path / "c.zip", files), "c").kind == "colmap"
     summary, ctx = ingest(tmp_path / "job", files)
     assert (summary["kind"], summary["num_posed"], summary["metric"]) == ("colmap", 10, False)
-    assert skipped_stages("colmap") == {"frames", "poses"}
+    assert skipped_stages("colmap") == {"frames"}
     assert_poses(ctx, TRUTH)
     assert cameras(ctx).cameras == TRUTH.cameras
     assert "applied_transform" not in cameras(ctx).notes, "a world that stands is not turned"

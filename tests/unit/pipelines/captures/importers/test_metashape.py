@@ -55,7 +55,7 @@ def test_poses_and_lenses_are_those_that_were_written(tmp_path: Path, name: str)
     files = PICTURES | {name: metashape_xml(TRUTH).encode()}
     assert sniff(write_zip(tmp_path / "c.zip", files), "c").kind == "metashape"
     summary, ctx = ingest(tmp_path / "job", files)
-    assert skipped_stages("metashape") == {"frames", "poses"}
+    assert skipped_stages("metashape") == {"frames"}
     assert (summary["num_posed"], summary["num_sensors"]) == (10, 3)
     assert_poses(ctx, TRUTH)
     assert_lenses(ctx, TRUTH, 1e-12)

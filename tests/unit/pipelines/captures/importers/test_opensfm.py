@@ -56,7 +56,7 @@ def test_poses_and_lenses_are_those_that_were_written(tmp_path: Path, folder: st
     assert sniff(write_zip(tmp_path / "c.zip", files), "c").kind == "opensfm"
     summary, ctx = ingest(tmp_path / "job", files)
     assert (summary["num_posed"], summary["metric"], summary["warnings"]) == (10, False, [])
-    assert skipped_stages("opensfm") == {"frames", "poses"}
+    assert skipped_stages("opensfm") == {"frames"}
     assert_poses(ctx, TRUTH)
     assert_lenses(ctx, TRUTH, 1e-12)
 

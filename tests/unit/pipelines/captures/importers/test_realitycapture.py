@@ -39,7 +39,7 @@ def test_poses_and_lenses_are_those_that_were_written(
     files = PICTURES | {name: realitycapture_csv(TRUTH, count=count).encode("utf-8-sig")}
     assert sniff(write_zip(tmp_path / "c.zip", files), "c").kind == "realitycapture"
     summary, ctx = ingest(tmp_path / "job", files)
-    assert skipped_stages("realitycapture") == {"frames", "poses"}
+    assert skipped_stages("realitycapture") == {"frames"}
     assert (summary["num_posed"], summary["metric"]) == (10, False)
     assert_poses(ctx, TRUTH)
     assert_lenses(ctx, TRUTH, 1e-9)

@@ -1,0 +1,380 @@
+"""Poses that came with a capture: do they fit the pictures, and can they be made to fit better?
+
+First some pairs are matched, and it is measured by how much matches miss the given poses. Poses
+that fit about as well as features are placed are trusted as they are: adjusting them would put in
+the features' own errors. Others are refined from matches of all pictures
+(`pipelines.sfm.given_refinement`), and the refined ones are taken where matches that were kept out
+of it say that they are clearly better, and nothing else speaks against them.
+
+Nothing here fails a capture: what goes wrong leaves the given poses, and is told.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pipelines.errors import Cancelled, PipelineError
+from pipelines.scene.cameras_file import Intrinsics
+from pipelines.scene.orientation import opengl_from_opencv
+from pipelines.sfm.agreement import LITTLE
+from pipelines.sfm.given_fit import Fit, fit_of
+from pipelines.sfm.given_pairs import overlapping_pairs, sampled_pairs
+from pipelines.sfm.given_refinement import Refined, refine
+from pipelines.sfm.pairs import Pairs
+from pipelines.sfm.tracks import Floats, build_tracks
+from pipelines.tools.colmap import CameraGroup, FeatureSettings, Reconstructor
+
+DepthRatio = tuple[float, float]
+"""See `pipelines.sfm.given_depth.depth_ratio`."""
+Mode = Literal["auto", "trust", "refine"]
+Verdict = Literal["trusted", "refined", "kept", "unverified"]
+
+EXACT_PX = 0.5
+"""Median miss up to which poses are trusted: exact ones have 0.2 to 0.35."""
+EXACT_WORST_PX = 1.0
+"""And that of the pair that nine in ten are better than: pairs from far apart tell of drift."""
+GAIN = 0.8
+"""Refined poses must miss matches that were held out by so much less, or leave the given ones."""
+HELD_SHARE = 0.15
+MOST_TURNED_DEG, MOST_MOVED = 10.0, 0.2
+"""Median turn, and median move in reaches (see `reach`), beyond which nobody would call it a
+refinement."""
+MOST_SCALED = 0.02
+"""By how much more the scale may leave that of the sensor's depth, as a share."""
+MOST_SPREAD = 1.15
+"""How many times as much points may deviate from the sensor's depth as they did before."""
+FEW_FEATURES, NUM_PROBES = 500, 5
+"""Features of the median of so many images below which images are doubled to find more."""
+_LOST = 0.5
+"""Agreement of an image's own pairs, in that of the median image, below which its pose is
+suspected."""
+_FINE = 0.7
+_USUAL = 0.6
+"""And that of the median image from which this can be told from drift."""
+_BASE_S, _PER_IMAGE_S = 300.0, 5.0
+"""Seconds after which refinement gives up: many times what it takes on a machine of two cores."""
+
+_UNREFINED = (PipelineError, ArithmeticError, MemoryError, OSError, RuntimeError, ValueError)
+"""What may go wrong in a refinement without harm to the job."""
+
+
+class OutOfTime(Exception):
+    """The refinement took longer than it may."""
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The images of a capture with given poses: N names, lenses, poses [N, 3, 4], OpenCV axes."""
+
+    files: tuple[str, ...]
+    lenses: tuple[Intrinsics, ...]
+    poses: Floats
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What came of it.
+
+    sampled: the given poses' fit to a sample of pairs, None where too few match. before, after: of
+    given and refined poses, by matches that were held out, where refinement got so far. refined:
+    its result, whether it was taken or not. why: in words. seconds: of all.
+    """
+
+    mode: Mode
+    verdict: Verdict
+    why: str
+    poses: Floats
+    sampled: Fit | None = None
+    before: Fit | None = None
+    after: Fit | None = None
+    refined: Refined | None = None
+    depths: tuple[DepthRatio, DepthRatio] | None = None
+    reading: str | None = None
+    seconds: float = 0.0
+
+    @property
+    def fit(self) -> Fit | None:
+        """How well the poses that are handed on fit, as far as that was measured."""
+        if self.verdict == "refined":
+            return self.after
+        return self.before or self.sampled
+
+
+class Judge:
+    """Judges and refines the given poses of one capture.
+
+    settings: of features. progress: receives the share that is done and a message; what it raises
+    ends all. depth_ratio: of refined or given points, see `pipelines.sfm.given_depth`.
+    """
+
+    def __init__(
+        self,
+        posed: Posed,
+        reconstructor: Reconstructor,
+        settings: FeatureSettings,
+        progress: Callable[[float, str], None],
+        depth_ratio: Callable[[Refined], DepthRatio | None],
+        *,
+        upsample: Literal["auto", "on", "off"],
+        num_threads: int,
+        seed: int,
+    ) -> None:
+        self._posed = posed
+        self._reconstructor = reconstructor
+        self._settings = settings
+        self._progress = progress
+        self._depth_ratio = depth_ratio
+        self._upsample = upsample
+        self._num_threads = num_threads
+        self._seed = seed
+        self._looked: set[int] = set()
+
+    def judge(self, mode: Mode, sent: Callable[[Floats], Floats]) -> Judged:
+        """The poses to hand on. sent: undoes what ingest did to the world of poses [N, 3, 4],
+        OpenGL axes, to see whether another reading of the file fits.
+
+        Raises what `progress` raises.
+        """
+        began = time.monotonic()
+        judged = Judged(mode, "unverified", "", self._posed.poses)
+        try:
+            judged = self._verified(judged, sent)
+            if self._is_to_refine(judged):
+                deadline = began + _BASE_S + _PER_IMAGE_S * len(self._posed.files)
+                judged = self._refined(judged, deadline)
+        except Cancelled:
+            raise
+        except OutOfTime:
+            judged = replace(judged, why="refining them would have taken too long")
+        except _UNREFINED as error:
+            judged = replace(judged, why=f"looking at them broke off: {_words(error)}")
+        return replace(judged, seconds=time.monotonic() - began)
+
+    def _is_to_refine(self, judged: Judged) -> bool:
+        if judged.mode == "trust" or judged.sampled is None or judged.reading is not None:
+            return False
+        return judged.mode == "refine" or judged.verdict != "trusted"
+
+    def _verified(self, judged: Judged, sent: Callable[[Floats], Floats]) -> Judged:
+        posed = self._posed
+        pairs = sampled_pairs(posed.poses)
+        self._settle_features()
+        self._match(pairs, (0.0, 0.3), "comparing pictures", lambda: None)
+        matches = self._reconstructor.verified_of(pairs)
+        fit = fit_of(posed.poses, posed.lenses, matches, self._settings.max_image_px)
+        if fit is None:
+            return replace(judged, why="too few of the pictures match each other to tell")
+        if fit.error_px <= EXACT_PX and fit.worst_px <= EXACT_WORST_PX and fit.agreement >= _FINE:
+            why = f"matches miss them by {fit.error_px:.2f} px, as those of exact poses do"
+            return replace(judged, verdict="trusted", why=why, sampled=fit)
+        reading = None
+        if fit.agreement < LITTLE:
+            for words, other in other_readings(sent(opengl_from_opencv(posed.poses))):
+                found = fit_of(other, posed.lenses, matches, self._settings.max_image_px)
+                if found is not None and found.agreement >= _FINE:
+                    reading = words
+        why = f"matches miss them by {fit.error_px:.2f} px"
+        return replace(judged, verdict="kept", why=why, sampled=fit, reading=reading)
+
+    def _settle_features(self) -> None:
+        """Double images where a few of them show too little."""
+        num = len(self._posed.files)
+        if self._upsample == "auto":
+            self._progress(0.0, "looking at a few pictures")
+            probes = sorted({round(i * (num - 1) / (NUM_PROBES - 1)) for i in range(NUM_PROBES)})
+            counts = self._reconstructor.count_features(probes, self._settings)
+            few = float(np.median(counts)) < FEW_FEATURES
+            self._settings = replace(self._settings, upsample=few)
+
+    def _refined(self, judged: Judged, deadline: float) -> Judged:
+        posed, long_side_px = self._posed, self._settings.max_image_px
+        assert judged.sampled is not None
+
+        def poll() -> None:
+            if time.monotonic() > deadline:
+                raise OutOfTime
+
+        def report(share: float, message: str) -> None:
+            poll()
+            self._progress(0.8 + 0.19 * share, message)
+
+        self._match(overlapping_pairs(posed.poses), (0.3, 0.8), "matching pictures", poll)
+        found = self._reconstructor.correspondences()
+        seen, held = build_tracks(found, HELD_SHARE, self._seed)
+        before = fit_of(posed.poses, posed.lenses, held, long_side_px)
+        if before is None:
+            return replace(judged, why=f"{judged.why}; too few matches to refine them by")
+        shown = (0.0, "adjusting the poses")
+
+        def say(share: float, message: str) -> None:
+            nonlocal shown
+            shown = share, message
+            report(share, message)
+
+        refined = refine(
+            posed.poses,
+            posed.lenses,
+            seen,
+            error_px=max(judged.sampled.worst_px, before.worst_px),
+            long_side_px=long_side_px,
+            run=self._reconstructor.runner(lambda: report(*shown)),
+            num_threads=self._num_threads,
+            seed=self._seed,
+            report=say,
+        )
+        after = fit_of(refined.poses, posed.lenses, held, long_side_px)
+        judged = replace(judged, before=before, after=after, refined=refined)
+        if refined.before is not None:
+            was, now = self._depth_ratio(refined.before), self._depth_ratio(refined)
+            if was is not None and now is not None:
+                judged = replace(judged, depths=(was, now))
+        against = self._objection(judged)
+        if against is not None:
+            return replace(judged, verdict="kept", why=f"{judged.why}; {against}")
+        assert after is not None
+        return replace(
+            judged,
+            verdict="refined",
+            poses=refined.poses,
+            why=f"matches that were set aside miss the given poses by {before.error_px:.2f} px, "
+            f"the refined ones by {after.error_px:.2f}",
+        )
+
+    def _objection(self, judged: Judged) -> str | None:
+        """What speaks against the refined poses, or None."""
+        before, after, refined = judged.before, judged.after, judged.refined
+        assert before is not None
+        assert refined is not None
+        if after is None or not refined.is_seen.any():
+            return "too few pictures hang together to refine them"
+        wanted = GAIN if judged.mode == "auto" else 1.0
+        if after.error_px > wanted * before.error_px or after.agreement < before.agreement:
+            return (
+                f"refined ones miss matches that were set aside by {after.error_px:.2f} px, the "
+                f"given ones by {before.error_px:.2f}"
+            )
+        turned, moved = movement(self._posed.poses, refined.poses)
+        far = float(np.median(moved)) / reach(self._posed.poses, refined)
+        if np.median(turned) > MOST_TURNED_DEG or far > MOST_MOVED:
+            return (
+                f"refined ones are {np.median(turned):.1f} degrees and {far:.0%} of the scene away"
+            )
+        if judged.depths is not None:
+            (scale, spread), (new_scale, new_spread) = judged.depths
+            if abs(np.log(new_scale)) > abs(np.log(scale)) + MOST_SCALED:
+                return f"refined ones are {new_scale:.3f} times the measured depth, not {scale:.3f}"
+            if new_spread > MOST_SPREAD * spread:
+                return (
+                    f"refined ones agree less with the measured depth, within {new_spread:.1%} "
+                    f"instead of {spread:.1%}"
+                )
+        return None
+
+    def _match(
+        self, pairs: Pairs, span: tuple[float, float], message: str, poll: Callable[[], None]
+    ) -> None:
+        """Features of the images of these pairs, as far as they have none, and their matches."""
+        start, end = span
+        middle = start + 0.6 * (end - start)
+        wanted = sorted({index for pair in pairs for index in pair} - self._looked)
+
+        def watch(first: float, last: float, total: int) -> Callable[[int], None]:
+            def report(done: int) -> None:
+                poll()
+                share = first + (last - first) * min(done, total) / max(total, 1)
+                self._progress(share, f"{message}, {min(done, total)} of {total}")
+
+            return report
+
+        if wanted:
+            self._reconstructor.extract(
+                feature_groups(wanted, self._posed.lenses),
+                self._settings,
+                watch(start, middle, len(wanted)),
+            )
+            self._looked |= set(wanted)
+        self._reconstructor.match(pairs, watch(middle, end, len(pairs)))
+
+
+def feature_groups(indices: Sequence[int], lenses: Sequence[Intrinsics]) -> list[CameraGroup]:
+    """The images in groups that COLMAP may take for one camera's.
+
+    Pairs of plain lenses are verified by a fundamental matrix, whatever the intrinsics, which may
+    be wrong; pairs of fisheyes cannot be.
+    """
+    alike: dict[tuple[str, int, int, float | None], list[int]] = {}
+    for index in indices:
+        lens = lenses[index]
+        wide = lens.model == "OPENCV_FISHEYE"
+        key = (
+            "OPENCV_FISHEYE" if wide else "SIMPLE_PINHOLE",
+            lens.width,
+            lens.height,
+            lens.fl_x if wide else None,
+        )
+        alike.setdefault(key, []).append(index)
+    return [CameraGroup(tuple(found), key[0], key[3]) for key, found in alike.items()]
+
+
+def movement(given: Floats, refined: Floats) -> tuple[Floats, Floats]:
+    """By how many degrees each pose was turned, and how far it was moved, [N] each."""
+    cosines = (np.einsum("nij,nij->n", given[:, :, :3], refined[:, :, :3]) - 1.0) / 2.0
+    turned: Floats = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    moved: Floats = np.linalg.norm(refined[:, :, 3] - given[:, :, 3], axis=1)
+    return turned, moved
+
+
+def reach(given: Floats, refined: Refined) -> float:
+    """How large the scene is: the cameras' extent, or how far points are away, the larger one."""
+    extent = float(np.linalg.norm(np.ptp(given[:, :, 3], axis=0)))
+    points = refined.points[refined.track_lengths >= 2]
+    if not len(points):
+        return max(extent, 1e-12)
+    middle = np.median(refined.poses[:, :, 3], axis=0)
+    return max(extent, float(np.median(np.linalg.norm(points - middle, axis=1))), 1e-12)
+
+
+def suspects(fit: Fit | None) -> list[int]:
+    """Images whose matches contradict their poses far more than others' do."""
+    if fit is None or np.isnan(fit.of_image).all():
+        return []
+    usual = float(np.nanmedian(fit.of_image))
+    if usual < _USUAL:
+        return []
+    with np.errstate(invalid="ignore"):
+        return [int(index) for index in np.flatnonzero(fit.of_image < _LOST * usual)]
+
+
+def other_readings(poses: Floats) -> list[tuple[str, Floats]]:
+    """What poses would be if they had been written by another convention, and its words.
+
+    poses: [N, 3, 4] as they were sent, OpenGL axes. Returns poses with OpenCV axes.
+    """
+    flip = np.diag([1.0, -1.0, -1.0])
+
+    def flipped(all_poses: Floats) -> Floats:
+        return np.concatenate([all_poses[:, :, :3] @ flip, all_poses[:, :, 3:]], axis=2)
+
+    def inverted(all_poses: Floats) -> Floats:
+        turned = all_poses[:, :, :3].transpose(0, 2, 1)
+        return np.concatenate([turned, -turned @ all_poses[:, :, 3:]], axis=2)
+
+    axes = "their cameras' axes are the others of OpenCV's (Y down, looking along +Z) and OpenGL's"
+    inverse = "they lead from the world to the camera, not from the camera to the world"
+    return [
+        (axes, poses),
+        (inverse, flipped(inverted(poses))),
+        (inverse, inverted(flipped(poses))),
+        ("each belongs to the picture after", flipped(np.roll(poses, -1, axis=0))),
+        ("each belongs to the picture before", flipped(np.roll(poses, 1, axis=0))),
+    ]
+
+
+def _words(error: BaseException) -> str:
+    text = error.message if isinstance(error, PipelineError) else str(error)
+    return (text or type(error).__name__).splitlines()[0][:200]

@@ -1,0 +1,109 @@
+"""What report.json says of poses that came with a capture, and what is to be told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipelines.sfm.agreement import LITTLE
+from pipelines.sfm.given import Judged, Posed, movement, suspects
+from pipelines.sfm.given_fit import Fit
+
+DOUBTFUL_PX = 3.0
+"""Median miss from which the report warns."""
+
+
+def given_report(judged: Judged, posed: Posed, long_side_px: int) -> dict[str, Any]:
+    """What report.json says under `given`."""
+    fit, refined = judged.fit, judged.refined
+    found: dict[str, Any] = {
+        "mode": judged.mode,
+        "verdict": judged.verdict,
+        "why": judged.why,
+        "features_px": long_side_px,
+        "sampled": None if judged.sampled is None else judged.sampled.as_dict(),
+        "refinement": None,
+        "suspects": [posed.files[index] for index in suspects(fit)],
+        "reading": judged.reading,
+        "seconds": round(judged.seconds, 2),
+    }
+    if refined is not None and judged.before is not None:
+        turned, moved = movement(posed.poses, refined.poses)
+        found["refinement"] = {
+            "taken": judged.verdict == "refined",
+            "before": judged.before.as_dict(),
+            "after": None if judged.after is None else judged.after.as_dict(),
+            "num_seen": int(refined.is_seen.sum()),
+            "num_carried": int((~refined.is_seen).sum()),
+            "replaced": [posed.files[index] for index in np.flatnonzero(refined.is_anew).tolist()],
+            "moved": {"median": _round(np.median(moved)), "most": _round(moved.max())},
+            "turned_deg": {"median": _round(np.median(turned)), "most": _round(turned.max())},
+            "extent": _round(np.linalg.norm(np.ptp(posed.poses[:, :, 3], axis=0))),
+            "sensor_depth": None
+            if judged.depths is None
+            else {
+                name: {"ratio": _round(ratio), "spread": _round(spread)}
+                for name, (ratio, spread) in zip(("before", "after"), judged.depths, strict=True)
+            },
+        }
+    return found
+
+
+def _round(value: Any) -> float:
+    return float(f"{float(value):.5g}")
+
+
+def given_warnings(judged: Judged, posed: Posed) -> list[dict[str, Any]]:
+    """What is to be told of poses that do not fit the pictures."""
+    fit = judged.fit
+    if fit is None:
+        return [
+            {
+                "code": "given_poses_unverified",
+                "message": f"Whether the capture's poses fit its pictures is not known: "
+                f"{judged.why}. They were taken as they are.",
+                "hint": "Nothing needs to be done where they come from a program that you trust.",
+                "details": {},
+            }
+        ]
+    wrong = suspects(fit)
+    if fit.agreement < LITTLE or wrong:
+        return [_contradicted(judged, fit, [posed.files[index] for index in wrong])]
+    if fit.error_px > DOUBTFUL_PX:
+        return [
+            {
+                "code": "given_poses_coarse",
+                "message": f"The capture's poses fit its pictures only coarsely: {judged.why}.",
+                "hint": "Expect blurred surfaces; poses.given=refine adjusts them wherever that is "
+                "no worse, or send the pictures alone to have their poses found.",
+                "details": {"error_px": round(fit.error_px, 3)},
+            }
+        ]
+    return []
+
+
+def _contradicted(judged: Judged, fit: Fit, files: list[str]) -> dict[str, Any]:
+    details = {"agreement": round(fit.agreement, 4), "error_px": round(fit.error_px, 3)}
+    if files:
+        names = ", ".join(files[:5]) + (", ..." if len(files) > 5 else "")
+        return {
+            "code": "given_poses_contradicted",
+            "message": f"{len(files)} of {len(judged.poses)} pictures show something else than "
+            f"their poses say: {names}.",
+            "hint": "Check that each pose belongs to its picture, or leave these pictures out.",
+            "details": {**details, "files": files},
+        }
+    hint = (
+        "Check that no picture was added, removed or renamed since the poses were written, and "
+        "which axes they are in; or send the pictures alone to have their poses found."
+    )
+    if judged.reading is not None:
+        hint = f"The pictures would fit if {judged.reading}: check how they were written. {hint}"
+    return {
+        "code": "given_poses_contradicted",
+        "message": f"The capture's poses agree with only {fit.agreement:.0%} of what its pictures "
+        "show.",
+        "hint": hint,
+        "details": details,
+    }

@@ -1,0 +1,146 @@
+"""Stage `poses` of a capture that brought its poses: they are verified, and refined where it helps.
+
+Writes cameras.json (the bytes of `ingest`, unless poses were refined), points.ply where there are
+points (those that came along; where poses were refined those that were found with them), and
+report.json (`given`: how well the poses fit, and what was done, see `pipelines.sfm.given`). World,
+scale and order stay those of `ingest`.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.exports.formats.ply import write_points
+from pipelines.options import PosesOptions
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.orientation import opengl_from_opencv
+from pipelines.sfm.attempts import num_processors
+from pipelines.sfm.given import Judge, Judged, Posed
+from pipelines.sfm.given_colors import colors_of
+from pipelines.sfm.given_depth import depth_ratio
+from pipelines.sfm.given_refinement import Refined
+from pipelines.sfm.given_report import given_report, given_warnings
+from pipelines.sfm.tracks import Floats, apart_deg
+from pipelines.stage import REPORT, StageContext
+from pipelines.tools.colmap import FeatureSettings, Reconstructor, extraction_threads
+from pipelines.workspace import SPARSE_POINTS
+
+MIN_TRACK = 3
+"""Points seen by fewer images are left out of points.ply: most of them are wrong."""
+MIN_APART_DEG = 0.75
+"""And points seen from nearly one direction (`apart_deg`): their distance is not known. COLMAP's
+1.5 degrees between two rays."""
+MOST_FEATURES = 4096
+"""Of an image: more say nothing more of its pose, and matching grows with their square."""
+
+
+def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
+    """Verify and perhaps refine the poses of `ingest`. The summary is report.json.
+
+    Raises ToolError and CaptureError never: what goes wrong leaves the poses as they came.
+    """
+    root = ctx.workspace.stage("ingest")
+    cameras = CamerasFile.load(root / "cameras.json")
+    posed = Posed(
+        files=tuple(image.file for image in cameras.images),
+        lenses=tuple(cameras.cameras[image.camera] for image in cameras.images),
+        poses=opengl_from_opencv(
+            np.array([image.world_from_camera for image in cameras.images]).reshape(-1, 3, 4)
+        ),
+    )
+    depths = [None if image.depth is None else root / image.depth for image in cameras.images]
+    with tempfile.TemporaryDirectory(prefix="poses-") as scratch:
+        reconstructor = Reconstructor(
+            Path(scratch) / "given.db",
+            [root / file for file in posed.files],
+            Path(scratch),
+            num_threads=options.num_threads if ctx.memory == "full" else 1,
+            seed=ctx.seed,
+        )
+
+        def measured(found: Refined) -> tuple[float, float] | None:
+            return depth_ratio(found, posed.lenses, depths)
+
+        judge = Judge(
+            posed,
+            reconstructor,
+            _settings(options, ctx),
+            lambda share, message: ctx.progress(share, message),
+            measured,
+            upsample=options.upsample,
+            num_threads=max(options.num_threads, 1)
+            if options.num_threads > 0
+            else num_processors(),
+            seed=ctx.seed,
+        )
+        judged = judge.judge(options.given, lambda poses: as_sent(poses, cameras.notes))
+    ctx.logger.info("The given poses are %s: %s", judged.verdict, judged.why)
+    ctx.progress(0.99, "writing the poses", 1.0)
+    _write(judged, posed, cameras, ctx)
+    warnings = given_warnings(judged, posed)
+    for warning in warnings:
+        ctx.logger.warning("%s %s", warning["message"], warning["hint"])
+    report = {
+        "num_images": len(posed.files),
+        "num_registered": len(posed.files),
+        "registered_ratio": 1.0,
+        "metric": cameras.metric,
+        "given": given_report(judged, posed, options.max_image_px),
+        "warnings": warnings,
+    }
+    (ctx.out / REPORT).write_text(json.dumps(report, indent=1), "utf-8")
+    ctx.progress(1.0, f"the given poses are {judged.verdict}", 0.0)
+    return report
+
+
+def as_sent(poses: Floats, notes: dict[str, Any]) -> Floats:
+    """Poses [N, 3, 4] in the world that they came in, but for its scale. notes: of cameras.json."""
+    applied = np.array(notes.get("applied_transform", np.eye(3, 4).tolist()), np.float64)
+    scale = float(notes.get("applied_scale", 1.0))
+    sent = applied[:, :3].T @ poses
+    sent[:, :, 3] -= scale * applied[:, :3].T @ applied[:, 3]
+    result: Floats = sent
+    return result
+
+
+def _settings(options: PosesOptions, ctx: StageContext) -> FeatureSettings:
+    wanted = FeatureSettings(
+        options.max_image_px,
+        min(options.num_features, MOST_FEATURES),
+        upsample=options.upsample == "on",
+        num_threads=options.num_threads,
+    )
+    memory_mb = int(options.memory_mb * ctx.memory_share)
+    # Of a doubled image, in case that few features turn out to be there.
+    threads = extraction_threads(replace(wanted, upsample=True), memory_mb, num_processors())
+    return replace(wanted, num_threads=threads)
+
+
+def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext) -> None:
+    """cameras.json and points.ply of the poses to hand on."""
+    root = ctx.workspace.stage("ingest")
+    refined = judged.refined
+    if judged.verdict != "refined" or refined is None:
+        for name in ("cameras.json", SPARSE_POINTS):
+            if (root / name).is_file():
+                shutil.copyfile(root / name, ctx.out / name)
+        return
+    poses = opengl_from_opencv(judged.poses)
+    images = tuple(
+        replace(image, world_from_camera=tuple(tuple(map(float, row)) for row in pose))
+        for image, pose in zip(cameras.images, poses, strict=True)
+    )
+    notes = {**cameras.notes, "poses": "refined"}
+    replace(cameras, images=images, notes=notes).save(ctx.out / "cameras.json")
+    apart = apart_deg(refined.seen, refined.points, refined.poses)
+    kept = np.flatnonzero((refined.track_lengths >= MIN_TRACK) & (apart >= MIN_APART_DEG))
+    if len(kept):
+        colors = colors_of(refined, [root / file for file in posed.files], kept)
+        write_points(ctx.out / SPARSE_POINTS, refined.points[kept].astype(np.float32), colors)

@@ -1,0 +1,276 @@
+"""Given poses beside pictures of a room whose true poses are known: real features, real COLMAP."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from pipelines.errors import Cancelled, ToolError
+from pipelines.options import PosesOptions
+from pipelines.sample.align import path_extent, similarity
+from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
+from pipelines.scene.sensor_depth import save_sensor_depth
+from pipelines.sfm import given
+from pipelines.stage import StageContext
+from pipelines.stages.poses import run
+from pipelines.tools.colmap import Reconstructor
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.sfm.synthetic_room import FOCAL, HEIGHT, WIDTH, arc_poses, render
+
+NUM, FEW = 16, 7
+TRUTH = arc_poses(NUM)
+EXTENT = path_extent(TRUTH[:, :, 3])
+OPTIONS = PosesOptions(num_features=1500, max_image_px=400, upsample="off", num_threads=2)
+Poses = np.ndarray
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[Image.Image]:
+    return [render(pose) for pose in TRUTH]
+
+
+def drifted(centers: float = 0.015, turns_deg: float = 1.0) -> Poses:
+    """The truth, off by up to so much of its extent and so many degrees, smoothly along the way."""
+    along = np.linspace(0.0, 2 * np.pi, NUM)
+    waves = np.stack([np.sin(along), np.cos(1.3 * along + 1.0), np.sin(0.7 * along + 2.0)], 1)
+    poses = TRUTH.copy()
+    poses[:, :, :3] = (
+        Rotation.from_rotvec(np.radians(turns_deg) * waves[:, ::-1]).as_matrix() @ (TRUTH[:, :, :3])
+    )
+    poses[:, :, 3] += centers * EXTENT * waves
+    return poses
+
+
+def context(
+    root: Path, poses: Poses, pictures: list[Image.Image], *, depth: float = 0.0, **more: Any
+) -> StageContext:
+    """A capture as `ingest` leaves it. depth: with a sensor's depth, of that scale."""
+    folder = Workspace(root).stage("ingest")
+    (folder / "images").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    lens = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    images = []
+    for index, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
+        file, depth_file = f"images/{index:05d}.jpg", f"depth/{index:05d}.npz"
+        picture.save(folder / file, quality=95)
+        if depth:
+            save_sensor_depth(
+                folder / depth_file, depth * true_depth(TRUTH[index]).astype(np.float32)
+            )
+        rows = tuple(tuple(float(value) for value in row) for row in pose)
+        images.append(PosedImage(file, 0, rows, depth=depth_file if depth else None))
+    CamerasFile((lens,), tuple(images), metric=True, source="nerfstudio").save(
+        folder / "cameras.json"
+    )
+    out = root / ".partial" / "poses"
+    out.mkdir(parents=True)
+    return StageContext("poses", Workspace(root), out, Workspace(root).checkpoint("poses"), **more)
+
+
+def true_depth(pose: Poses) -> np.ndarray:
+    """[75, 100] of the room, along the camera's axis."""
+    u, v = np.meshgrid((np.arange(100) + 0.5) * 4, (np.arange(75) + 0.5) * 4)
+    local = np.stack(
+        [(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL, -np.ones_like(u)], axis=-1
+    )
+    rays = local @ pose[:, :3].T
+    with np.errstate(divide="ignore"):
+        return np.where(rays < 0, -pose[:, 3] / rays, np.inf).min(axis=-1)
+
+
+def found(ctx: StageContext) -> Poses:
+    images = CamerasFile.load(ctx.out / "cameras.json").images
+    return np.array([image.world_from_camera for image in images])
+
+
+def errors(poses: Poses) -> tuple[float, float]:
+    """Of centres, as a share of the extent, and of turns in degrees, means after the best
+    similarity."""
+    move = similarity(poses[:, :, 3], TRUTH[:, :, 3])
+    centers = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - TRUTH[:, :, 3], axis=1)
+    turned = move.apply_to_cameras(poses)[:, :, :3]
+    cosines = ((turned * TRUTH[:, :, :3]).sum((1, 2)) - 1) / 2
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return float(centers.mean() / EXTENT), float(angles.mean())
+
+
+def assert_as_given(ctx: StageContext) -> None:
+    given_bytes = (ctx.workspace.stage("ingest") / "cameras.json").read_bytes()
+    assert (ctx.out / "cameras.json").read_bytes() == given_bytes
+
+
+def codes(summary: dict[str, Any]) -> list[str]:
+    return [warning["code"] for warning in summary["warnings"]]
+
+
+def test_exact_poses_are_trusted_and_stay_as_they_are(
+    tmp_path: Path, pictures: list[Image.Image]
+) -> None:
+    ctx = context(tmp_path, TRUTH, pictures)
+    summary = run(OPTIONS, ctx)
+    assert summary["given"]["verdict"] == "trusted"
+    assert not codes(summary)
+    assert summary["given"]["sampled"]["error_px"] < 0.4
+    assert summary["given"]["refinement"] is None
+    assert_as_given(ctx)
+    assert json.loads((ctx.out / "report.json").read_text()) == summary
+
+
+def test_drifted_poses_are_refined_towards_the_truth_at_their_own_place_and_scale(
+    tmp_path: Path, pictures: list[Image.Image]
+) -> None:
+    poses = drifted()
+    steps: list[float] = []
+    ctx = context(
+        tmp_path, poses, pictures, depth=1.0, on_progress=lambda share, *_: steps.append(share)
+    )
+    summary = run(OPTIONS, ctx)
+    told = summary["given"]
+    assert told["verdict"] == "refined"
+    assert not codes(summary)
+    (centers, turns), (given_centers, given_turns) = errors(found(ctx)), errors(poses)
+    assert centers < 0.001
+    assert turns < 0.25
+    assert centers < 0.1 * given_centers
+    assert turns < 0.5 * given_turns
+    # In the frame that they came in: no more off than drift moves the whole.
+    apart = np.linalg.norm(found(ctx)[:, :, 3] - TRUTH[:, :, 3], axis=1)
+    assert apart.mean() < np.linalg.norm(poses[:, :, 3] - TRUTH[:, :, 3], axis=1).mean()
+    assert abs(similarity(found(ctx)[:, :, 3], poses[:, :, 3]).scale - 1) < 0.01
+    depth = told["refinement"]["sensor_depth"]
+    assert abs(depth["after"]["ratio"] - depth["before"]["ratio"]) < given.MOST_SCALED
+    assert depth["after"]["spread"] < 0.3 * depth["before"]["spread"]
+    assert told["refinement"]["num_carried"] == 0
+    assert told["refinement"]["replaced"] == []
+    assert steps == sorted(steps)
+    assert len(set(steps)) > 10
+    assert (ctx.out / "points.ply").is_file()
+
+
+def test_a_picture_that_shows_nothing_goes_with_its_neighbours(
+    tmp_path: Path, pictures: list[Image.Image]
+) -> None:
+    blank = [*pictures[:6], Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90)), *pictures[7:]]
+    poses = drifted()
+    ctx = context(tmp_path, poses, blank)
+    summary = run(OPTIONS, ctx)
+    assert summary["given"]["verdict"] == "refined"
+    assert summary["given"]["refinement"]["num_carried"] == 1
+    move = similarity(found(ctx)[:, :, 3], TRUTH[:, :, 3])
+    off = np.linalg.norm(move.apply_to_points(found(ctx)[:, :, 3]) - TRUTH[:, :, 3], axis=1)
+    assert off[6] < 0.005 * EXTENT
+
+
+def test_two_mixed_up_rows_are_placed_anew(tmp_path: Path, pictures: list[Image.Image]) -> None:
+    poses = drifted()
+    poses[[4, 11]] = poses[[11, 4]]
+    ctx = context(tmp_path, poses, pictures)
+    told = run(OPTIONS, ctx)["given"]
+    assert told["verdict"] == "refined"
+    assert told["refinement"]["replaced"] == ["images/00004.jpg", "images/00011.jpg"]
+    centers, turns = errors(found(ctx))
+    assert centers < 0.002
+    assert turns < 0.3
+
+
+def test_two_mixed_up_rows_are_named_where_poses_are_to_be_trusted(
+    tmp_path: Path, pictures: list[Image.Image]
+) -> None:
+    poses = TRUTH.copy()
+    poses[[4, 11]] = poses[[11, 4]]
+    ctx = context(tmp_path, poses, pictures)
+    summary = run(OPTIONS.model_copy(update={"given": "trust"}), ctx)
+    (warning,) = summary["warnings"]
+    assert warning["code"] == "given_poses_contradicted"
+    assert "00011" in warning["message"]
+    assert warning["details"]["files"] == ["images/00004.jpg", "images/00011.jpg"]
+    assert_as_given(ctx)
+
+
+def test_poses_with_axes_of_another_program_are_told_and_stay(
+    tmp_path: Path, pictures: list[Image.Image]
+) -> None:
+    ctx = context(tmp_path, TRUTH * np.array([1.0, -1.0, -1.0, 1.0]), pictures)
+    summary = run(OPTIONS, ctx)
+    (warning,) = summary["warnings"]
+    assert warning["code"] == "given_poses_contradicted"
+    assert "axes" in warning["hint"]
+    assert "would fit if" in warning["hint"]
+    assert summary["given"]["verdict"] == "kept"
+    assert_as_given(ctx)
+
+
+def test_inverted_poses_are_told_by_the_world_that_they_came_in() -> None:
+    turned = np.linalg.inv(np.concatenate([TRUTH, np.tile([[[0, 0, 0, 1.0]]], (NUM, 1, 1))], 1))
+    words = [
+        text
+        for text, poses in given.other_readings(turned[:, :3])
+        if np.allclose(poses * np.array([1.0, -1.0, -1.0, 1.0]), TRUTH)
+    ]
+    assert len(words) == 1
+    assert "world to the camera" in words[0]
+
+
+def test_pictures_without_matches_leave_the_poses_and_say_so(tmp_path: Path) -> None:
+    plain = [Image.new("RGB", (WIDTH, HEIGHT), (90, 90, index)) for index in range(NUM)]
+    ctx = context(tmp_path, drifted(), plain)
+    summary = run(OPTIONS, ctx)
+    assert summary["given"]["verdict"] == "unverified"
+    assert codes(summary) == ["given_poses_unverified"]
+    assert_as_given(ctx)
+
+
+def test_depth_that_the_refined_poses_contradict_keeps_the_given_ones(
+    tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.stages.given_poses.depth_ratio", _worse_when_refined())
+    ctx = context(tmp_path, drifted()[:FEW], pictures[:FEW])
+    told = run(OPTIONS, ctx)["given"]
+    assert told["verdict"] == "kept"
+    assert "measured depth" in told["why"]
+    assert_as_given(ctx)
+
+
+def _worse_when_refined() -> Any:
+    return lambda found, *_: (1.0, 0.01) if found.before is None else (1.05, 0.01)
+
+
+@pytest.mark.parametrize("broken", [ToolError("no"), ValueError("no"), given.OutOfTime()])
+def test_a_refinement_that_breaks_off_leaves_the_given_poses(
+    tmp_path: Path,
+    pictures: list[Image.Image],
+    monkeypatch: pytest.MonkeyPatch,
+    broken: Exception,
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise broken
+
+    monkeypatch.setattr(given, "refine", fail)
+    ctx = context(tmp_path, drifted()[:FEW], pictures[:FEW])
+    summary = run(OPTIONS, ctx)
+    assert summary["given"]["verdict"] == "kept"
+    assert_as_given(ctx)
+
+
+def test_a_capture_whose_features_cannot_be_found_goes_on(
+    tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise ToolError("COLMAP failed.")
+
+    monkeypatch.setattr(Reconstructor, "extract", fail)
+    ctx = context(tmp_path, drifted()[:FEW], pictures[:FEW])
+    assert codes(run(OPTIONS, ctx)) == ["given_poses_unverified"]
+    assert_as_given(ctx)
+
+
+def test_a_cancel_ends_it(tmp_path: Path, pictures: list[Image.Image]) -> None:
+    ctx = context(tmp_path, drifted(), pictures, is_cancelled=lambda: True)
+    with pytest.raises(Cancelled):
+        run(OPTIONS, ctx)
