@@ -213,9 +213,9 @@ def test_job_skips_what_is_current_and_redoes_what_is_stale(tmp_path: Path) -> N
             overrides,
             kind="nerfstudio",
             on_reused=lambda stage: reused.append(stage.name),
-            until="poses",
+            until="frames",
         )
-        assert list(manifests) == ["ingest"]  # no frames and no poses for a capture with poses
+        assert list(manifests) == ["ingest"]  # no frames for a capture with poses
         return list(reused)
 
     assert run() == []
@@ -249,14 +249,14 @@ def test_missing_inputs_leave_out_skipped_stages(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path)
     before = ["ingest", "frames", "poses", "depth"]
     assert missing_inputs("train", "preview", "video", workspace) == before
-    assert missing_inputs("train", "preview", "polycam", workspace) == ["ingest", "depth"]
+    assert missing_inputs("train", "preview", "polycam", workspace) == ["ingest", "poses", "depth"]
     assert missing_inputs("report", "draft", "video", workspace) == [
         *before[:3],
         "check",
         "depth",
         "draft",
     ]
-    assert missing_inputs("report", "check", "polycam", workspace) == ["ingest", "check"]
+    assert missing_inputs("report", "check", "polycam", workspace) == ["ingest", "poses", "check"]
 
 
 @pytest.fixture
