@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
-INPUT, OUTPUT = "piece.npz", "fewer.npz"
+INPUT, OUTPUT = "given.npz", "made.npz"
 _OVERSHOOT = 1.02
 
 

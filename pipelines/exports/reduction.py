@@ -11,11 +11,7 @@ The work itself is `pipelines.exports.decimation`.
 
 from __future__ import annotations
 
-import sys
-import tempfile
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,17 +21,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipelines.exports import decimation
+from pipelines.exports.apart import run_apart
 from pipelines.exports.decimation import decimated
 from pipelines.exports.mesh import Floats, TriangleMesh, joined
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
-from pipelines.tools.process import Program
 
 _LEAST_PIECE = 200
 """Faces; what is smaller is reduced together with its like."""
 LARGE = 300_000
 """Faces of a piece that has a process of its own."""
-_USUAL_S, _TELL_S = 6e-6, 1.0
-"""How long a face takes, for what is told while nobody knows how far it is; how often to tell."""
+_USUAL_S = 6e-6
+"""How long a face takes, for what is told while nobody knows how far it is."""
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
 _core: Any = open3d.core
@@ -81,42 +77,14 @@ def _fewer(
     if len(mesh.faces) < LARGE:
         vertices, faces = decimated(local, mesh.faces, triangles)
     else:
-        vertices, faces = _elsewhere(local, mesh.faces, triangles, on_progress)
+        given = {"vertices": local, "faces": mesh.faces, "triangles": triangles}
+        usual_s = _USUAL_S * len(mesh.faces)
+        made_apart = run_apart(decimation.__file__, given, usual_s, on_progress)
+        vertices, faces = made_apart["vertices"], made_apart["faces"]
     made = TriangleMesh(
         vertices * size + origin, faces, _colors_at(mesh, local, vertices), np.zeros_like(vertices)
     )
     return from_open3d(to_open3d(made, origin), origin)
-
-
-def _elsewhere(
-    vertices: Floats,
-    faces: NDArray[np.int32],
-    triangles: int,
-    on_progress: Callable[[float], None],
-) -> tuple[Floats, NDArray[np.int32]]:
-    """`decimated` in a process of its own, which ends with whatever on_progress raises.
-
-    Raises ToolError where it fails.
-    """
-    begun = told = time.monotonic()
-    usual_s = _USUAL_S * len(faces)
-
-    def wait() -> bool:
-        nonlocal told
-        if (now := time.monotonic()) - told >= _TELL_S:
-            told = now
-            on_progress((now - begun) / (now - begun + usual_s))
-        return False
-
-    with tempfile.TemporaryDirectory(prefix="decimation-") as name:
-        folder = Path(name)
-        np.savez(folder / decimation.INPUT, vertices=vertices, faces=faces, triangles=triangles)
-        # -P: the modules beside the script are no modules of the programs that it uses.
-        command = [sys.executable, "-P", decimation.__file__, name]
-        with Program(command, is_cancelled=wait) as program:
-            program.wait()
-        with np.load(folder / decimation.OUTPUT) as fewer:
-            return fewer["vertices"], fewer["faces"]
 
 
 def _colors_at(mesh: TriangleMesh, local: Floats, points: Floats) -> Floats:

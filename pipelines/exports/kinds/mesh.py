@@ -44,7 +44,7 @@ _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 
 
 class MeshOptions(CropOptions, TextureOptions):
-    """The mesh, by fusing rendered depth (TSDF)."""
+    """The mesh, by fusing rendered depth."""
 
     formats: tuple[Format, ...] = Field(
         ("glb", "ply"),
@@ -58,6 +58,12 @@ class MeshOptions(CropOptions, TextureOptions):
         description="Which axis is up in ply, obj and stl. In glb and usdz it is always y.",
     )
 
+    method: Literal["tsdf", "poisson"] = Field(
+        "tsdf",
+        description="How depth becomes a surface: tsdf fuses it in a field of voxels; poisson lays "
+        "a smooth surface through the points that views agree on, closes small holes, and takes "
+        "longer.",
+    )
     resolution: int = Field(
         256,
         ge=32,
@@ -176,6 +182,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             shells,
             options.max_faces,
             _part_of(ctx, "fusing depth", _AFFORD_SHARE, _FUSE_SHARE),
+            options.method,
         )
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
@@ -229,6 +236,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     return {
         "frame": place.as_dict(),
         "formats": list(options.formats),
+        "method": options.method,
         "num_vertices": len(mesh.vertices),
         **_told(skin),
         "levels": levels,

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.surface.clean import clean
+from pipelines.exports.surface.poisson import reconstruct
 from pipelines.exports.surface.tsdf import Blocks, affordable_blocks, fuse
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.depth_views import ViewStore
 
+Method = Literal["tsdf", "poisson"]
 REACH = 3.0
 _MIN_GROWTH = 1.2
 """What is hardly larger than the shell in it shows nothing new and is left out."""
@@ -81,11 +84,12 @@ def fuse_shells(
     shells: Sequence[Shell],
     max_faces: int,
     on_progress: Callable[[float], None] = lambda fraction: None,
+    method: Method = "tsdf",
 ) -> TriangleMesh:
     """All shells fused and cleaned, as one mesh; may be without vertices.
 
     max_faces: of the innermost shell; each other one has at most a quarter of it. on_progress: told
-    the share that is done; may raise.
+    the share that is done; may raise. method: how a shell's surface is made of the views.
     """
     pieces = []
     for index, shell in enumerate(shells):
@@ -96,7 +100,10 @@ def fuse_shells(
         def on_cleaned(done: float, before: int = index) -> None:
             on_progress((before + _FUSE_SHARE + (1.0 - _FUSE_SHARE) * done) / len(shells))
 
-        fused = fuse(views, shell.bounds, shell.voxel, on_fused, shell.blocks)
+        if method == "poisson":
+            fused = reconstruct(views, shell.bounds, shell.voxel, on_fused)
+        else:
+            fused = fuse(views, shell.bounds, shell.voxel, on_fused, shell.blocks)
         if index:
             fused = _outside(fused, shells[index - 1].bounds, shell.voxel)
         faces = max_faces if index == 0 else max(100, int(_OUTER_FACES * max_faces))

@@ -41,7 +41,8 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
 def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
     job: Workspace,
 ) -> None:
-    manifest = tiny_job.run(job, "mesh", refine="none", formats=("usdz", "stl", "usdz"))
+    manifest = tiny_job.run(job, "mesh", method="poisson", formats=("usdz", "stl", "usdz"))
+    assert manifest["summary"]["method"] == "poisson"
     assert manifest["summary"]["formats"] == ["usdz", "stl"]
     files = {file["path"] for file in manifest["files"]}
     artifacts = {artifact.path for artifact in get_stage("mesh").artifacts}
