@@ -130,7 +130,7 @@ def wrong_objects(
 
     swept: whether there must be nothing that no record names.
     """
-    wrong, named = [], set()
+    wrong, named, kept = [], set(), set()
     digests = {entry.id: entry for entry in session.scalars(select(Capture))}
     for capture in digests.values():
         if capture.deleted_at is None:
@@ -141,6 +141,8 @@ def wrong_objects(
     jobs = {job.id: job for job in session.scalars(select(Job))}
     for row in rows:
         job = jobs.get(row.job_id)
+        if job is not None and row.checkpoint_prefix:
+            kept.add(row.checkpoint_prefix)  # of a stage that was cut short: a retry goes on there
         if job is None or not row.output_prefix or not row.manifest:
             continue
         is_result = row.state == "succeeded"
@@ -161,6 +163,9 @@ def wrong_objects(
             if files.get(CHAIN) != must:
                 wrong.append(f"{row.id} was made from something else")
     held = {key for root in ROOTS for key in store.list(root)}
+    there = {prefix: {key for key in held if key.startswith(prefix)} for prefix in kept}
+    wrong += [f"{prefix} is missing" for prefix, keys in there.items() if not keys]
+    named |= set().union(*there.values())
     wrong += [f"{key} is missing" for key in sorted(named - held)]
     if swept:
         wrong += [f"{key} belongs to no record" for key in sorted(held - named)]

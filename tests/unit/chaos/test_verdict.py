@@ -19,7 +19,7 @@ from pipelines.workspace import MANIFEST
 from storage.claims import claim_stage
 from storage.db import Database, now
 from storage.jobs import create_job, stage_id
-from storage.keys import attempt_prefix, blob_content
+from storage.keys import attempt_prefix, blob_content, checkpoint_prefix
 from storage.leases import succeed_stage
 from storage.models import (
     Blob,
@@ -145,6 +145,26 @@ def test_a_good_world_is_found_good(world: World) -> None:
     assert world.found() == {}
 
 
+def name_checkpoint(world: World) -> Path:
+    """As of a stage that was cancelled once it had saved its state. Where its file would lie."""
+    job_id = world.accepted[0].job_id
+    with world.database.session_scope() as session:
+        root = session.get_one(Job, job_id).object_root
+        row = session.get_one(StageRow, stage_id(job_id, "depth"))
+        row.checkpoint_prefix = checkpoint_prefix(root, "depth", 1, 2)
+        return world.store.path_of(f"{row.checkpoint_prefix}step.json")
+
+
+def test_a_checkpoint_that_a_retry_would_go_on_from_belongs_there(world: World) -> None:
+    path = name_checkpoint(world)
+    path.parent.mkdir(parents=True)
+    path.write_text("{}")
+    assert world.found() == {}
+    path.parent.with_name("1-1").mkdir()
+    (path.parent.with_name("1-1") / "step.json").write_text("{}")
+    assert list(world.found()) == [OBJECTS]
+
+
 STATES, HISTORIES = "jobs in a wrong state", "histories that do not hold"
 REPEATED, ROWS = "finished work repeated", "rows left behind"
 OBJECTS = "objects wrong or left behind"
@@ -247,6 +267,7 @@ PLANTED: dict[str, tuple[Callable[[World], object], str]] = {
     "a file lost": (lambda world: world.path(0, "depth", CHAIN).unlink(), OBJECTS),
     "a file damaged": (lambda world: world.path(0, "depth", CHAIN).write_text("x"), OBJECTS),
     "files of another job": (swap_contents, OBJECTS),
+    "a checkpoint lost": (name_checkpoint, OBJECTS),
     "a file of nobody": (lambda world: world.path(0, "depth", "other").write_text("x"), OBJECTS),
     "a capture damaged": (lambda world: world.capture_path().write_text("x"), OBJECTS),
     "a capture's record lost": (
