@@ -27,6 +27,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from storage.bell import Bell
+from storage.clock import bring_times_back
 from storage.db import Database, now
 from storage.deletions import drain_deletions
 from storage.idempotency import forget_old
@@ -85,8 +86,14 @@ class Grace:
         self._last: datetime | None = None
         self._until: datetime | None = None
 
+    def is_new(self, moment: datetime) -> bool:
+        """Whether the clock went back since the last round, or nobody knows: there was none."""
+        return self._last is None or moment < self._last
+
     def is_over(self, moment: datetime) -> bool:
         """To be asked every round, by the clock that leases go by."""
+        if self._last is not None and moment < self._last:
+            self._until = None  # of a time that is still to come
         if self._last is not None and moment - self._last > max(self._gap, self._pause):
             self._until = moment + self._pause
             _log.warning("away for %.0f s: leases get some grace", (moment - self._last).seconds)
@@ -159,14 +166,28 @@ class Housekeeping:
             self._stopped.wait(pause_s)
 
     def reap(self) -> None:
-        """Take back stages whose leases ran out; not at once where we ourselves were away."""
+        """Take back stages whose leases ran out; not at once where we ourselves were away.
+
+        Where the clock went back, what it left ahead of itself is said anew first: in a transaction
+        of its own, so that a round that fails is done again.
+        """
         actor = f"reaper:{socket.gethostname()}"
+        with self._database.read_scope() as session:
+            is_new = self._grace.is_new(now(session))
+        if is_new:
+            self._bring_times_back(actor)
         with self._database.session_scope(actor, step="reap") as session:
             moment = now(session)
             ready = reap_expired(session, moment) if self._grace.is_over(moment) else []
         if ready:
             _log.warning("lost their workers: %s", ", ".join(ready))
             self._bell.ring(ready)
+
+    def _bring_times_back(self, actor: str) -> None:
+        with self._database.session_scope(actor) as session:
+            ahead = bring_times_back(session, now(session))
+        if ahead:
+            _log.warning("the clock went back; times of %d stages said anew", len(ahead))
 
     def dispatch(self) -> None:
         """Ring for ready stages that nobody came for."""

@@ -13,9 +13,11 @@ import pytest
 
 from storage.bell import Bell
 from storage.claims import claim_stage
+from storage.db import Database, now
 from storage.jobs import request_cancel, stage_id
 from storage.leases import cancel_stage, heartbeat
 from storage.models import PendingDeletion, StageRow, Worker
+from storage.objects import ObjectStore
 from storage.objects_local import LocalObjectStore
 from storage.open_objects import open_object_store
 from storage.queries import WaitingStage
@@ -29,6 +31,27 @@ from worker.settings import WorkerSettings
 
 T0 = datetime(2026, 1, 1, tzinfo=UTC)
 NO_BROKER = "redis://127.0.0.1:1/0"
+
+
+def keeper_of(
+    database: Database,
+    tmp_path: Path,
+    settings: WorkerSettings | None = None,
+    *,
+    store: ObjectStore | None = None,
+    bell: Bell | None = None,
+    register: Callable[[], None] = lambda: None,
+) -> Housekeeping:
+    """A worker's housekeeping, with `work` and `objects` below the folder, and no broker."""
+    return Housekeeping(
+        database,
+        store or LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
+        bell or Bell(NO_BROKER, database),
+        settings or WorkerSettings(),
+        work_dir=tmp_path / "work",
+        register=register,
+        offer=lambda: None,
+    )
 
 
 def waiting(rung_after_s: float | None) -> WaitingStage:
@@ -70,15 +93,7 @@ def test_cleaning_forgets_workers_that_are_long_gone(tmp_path: Path) -> None:
             has_gpu=False,
             when=T0,
         )
-    Housekeeping(
-        database,
-        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
-        Bell(NO_BROKER, database),
-        WorkerSettings(),
-        work_dir=tmp_path / "work",
-        register=lambda: None,
-        offer=lambda: None,
-    ).clean()
+    keeper_of(database, tmp_path).clean()
     with database.read_scope() as session:
         assert session.query(Worker).count() == 0
 
@@ -92,15 +107,7 @@ def test_folders_go_when_their_job_is_over_and_nothing_of_it_runs(tmp_path: Path
         request_cancel(session, over)
     for name in (live, over, "of-no-job"):
         (work / name / "train").mkdir(parents=True)
-    keeper = Housekeeping(
-        database,
-        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
-        Bell(NO_BROKER, database),
-        WorkerSettings(),
-        work_dir=work,
-        register=lambda: None,
-        offer=lambda: None,
-    )
+    keeper = keeper_of(database, tmp_path)
     keeper.clean()
     assert {path.name for path in work.iterdir()} == {live, over}
     assert claim is not None
@@ -127,15 +134,7 @@ def test_a_job_that_is_retried_while_its_old_folder_goes_keeps_its_new_one(
         remove(folder, ignore_errors=ignore_errors)
 
     monkeypatch.setattr("worker.housekeeping.shutil.rmtree", retried_meanwhile)
-    keeper = Housekeeping(
-        database,
-        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
-        Bell(NO_BROKER, database),
-        WorkerSettings(),
-        work_dir=work,
-        register=lambda: None,
-        offer=lambda: None,
-    )
+    keeper = keeper_of(database, tmp_path)
     keeper._clean_folders()
     assert [path.name for path in work.iterdir()] == [job]
     assert (work / job / "ingest").is_dir()
@@ -154,15 +153,7 @@ def test_the_loop_outlives_a_round_that_fails(tmp_path: Path) -> None:
         raise RuntimeError("no database today")
 
     database = make_database(tmp_path)
-    keeper = Housekeeping(
-        database,
-        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
-        Bell(NO_BROKER, database),
-        WorkerSettings(tick_s=0.01),
-        work_dir=tmp_path / "work",
-        register=register,
-        offer=lambda: None,
-    )
+    keeper = keeper_of(database, tmp_path, WorkerSettings(tick_s=0.01), register=register)
     keeper.start()
     assert third.wait(10)
     keeper.stop(10)
@@ -188,10 +179,7 @@ def test_reaping_is_on_time_while_broker_and_object_store_hang(
         session.add(PendingDeletion(prefix="jobs/gone/", created_at=T0))
     bell = Bell(f"redis://127.0.0.1:{hung}/0", database, timeout_s=1.0)
     settings = WorkerSettings(tick_s=0.05, clean_s=0.05)
-    work = tmp_path / "work"
-    keeper = Housekeeping(
-        database, store, bell, settings, work_dir=work, register=lambda: None, offer=lambda: None
-    )
+    keeper = keeper_of(database, tmp_path, settings, store=store, bell=bell)
     keeper.start()
     try:
         for _ in range(3):
@@ -250,15 +238,7 @@ def test_a_machine_that_slept_loses_no_lease_but_one_whose_worker_is_gone(
         )
     assert lives is not None
     assert gone is not None
-    keeper = Housekeeping(
-        database,
-        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
-        Bell(NO_BROKER, database),
-        WorkerSettings(),
-        work_dir=tmp_path / "work",
-        register=lambda: None,
-        offer=lambda: None,
-    )
+    keeper = keeper_of(database, tmp_path)
 
     def reap(at_s: float) -> list[str | None]:
         monkeypatch.setattr("worker.housekeeping.now", lambda session: at(at_s))
@@ -275,4 +255,53 @@ def test_a_machine_that_slept_loses_no_lease_but_one_whose_worker_is_gone(
         assert not heartbeat(session, lives, 60.0, when=at(3603)).lost
     assert reap(3602) == ["running", "running"]
     assert reap(3611) == ["running", "ready"]
+    database.dispose()
+
+
+def test_a_clock_that_goes_back_an_hour_leaves_no_lease_for_an_hour(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the reaper was away before: the grace that it gave ends in its time."""
+    database = make_database(tmp_path)
+    with database.session_scope() as session:
+        lives, gone = (
+            claim_stage(session, stage_id(make_job(session).id, "first"), "w", 60.0, when=T0)
+            for _ in range(2)
+        )
+    assert lives is not None
+    assert gone is not None
+    keeper = keeper_of(database, tmp_path)
+
+    def at(seconds: float) -> datetime:
+        return T0 + timedelta(seconds=seconds)
+
+    def reap(at_s: float) -> list[str]:
+        monkeypatch.setattr("worker.housekeeping.now", lambda session: at(at_s))
+        keeper.reap()
+        with database.read_scope() as session:
+            return [session.get_one(StageRow, claim.stage_id).state for claim in (lives, gone)]
+
+    assert reap(2) == ["running", "running"]
+    assert reap(40) == ["running", "running"]
+    assert reap(40 - 3600) == ["running", "running"]
+    with database.session_scope() as session:
+        assert not heartbeat(session, lives, 60.0, when=at(90 - 3600)).lost
+    assert reap(60 - 3600) == ["running", "running"]
+    assert reap(80 - 3600) == ["running", "running"]
+    assert reap(99 - 3600) == ["running", "running"]
+    assert reap(102 - 3600) == ["running", "ready"]
+    database.dispose()
+
+
+def test_a_reaper_that_starts_after_the_clock_went_back_sees_it(tmp_path: Path) -> None:
+    database = make_database(tmp_path)
+    with database.session_scope() as session:
+        later = now(session) + timedelta(hours=1)
+        held = stage_id(make_job(session).id, "first")
+        assert claim_stage(session, held, "w", 60.0, when=later) is not None
+    keeper_of(database, tmp_path).reap()
+    with database.read_scope() as session:
+        until = session.get_one(StageRow, held).lease_until
+        assert until is not None
+        assert until - now(session) < timedelta(seconds=61)
     database.dispose()
