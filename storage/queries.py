@@ -46,6 +46,7 @@ class StageWork:
 
     capture_key: str
     capture_bytes: int
+    capture_sha256: str
     filename: str
     kind: str
     seed: int
@@ -184,6 +185,7 @@ def stage_work(session: Session, claim: Claim) -> StageWork:
     return StageWork(
         capture_key=job.capture.object_key,
         capture_bytes=job.capture.bytes,
+        capture_sha256=job.capture.sha256,
         filename=job.capture.filename,
         kind=job.capture.kind,
         seed=job.seed,

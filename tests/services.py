@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import redis
 import sqlalchemy as sa
 
 
@@ -106,6 +107,11 @@ class RedisServer:
             [self.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         wait_for_port(self.port, self.process)
+
+    def configure(self, name: str, value: str) -> None:
+        """Change a setting while it runs."""
+        with redis.Redis.from_url(self.url) as client:
+            client.config_set(name, value)
 
     def kill(self) -> None:
         assert self.process is not None

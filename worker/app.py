@@ -38,6 +38,9 @@ def make_app(settings: StorageSettings) -> Celery:
         broker_connection_retry=True,
         broker_connection_retry_on_startup=True,
         broker_connection_max_retries=None,
+        # A Redis without memory, disk or replicas answers, and refuses to write, which taking a
+        # message is: no reason to end a worker and the stages that it runs.
+        broker_channel_error_retry=True,
         broker_connection_timeout=4.0,
         broker_transport_options={
             "visibility_timeout": DAY_S,

@@ -18,6 +18,7 @@ from typing import Any
 from worker.containment.apply import Containment
 from worker.containment.plan import Plan
 from worker.leftovers import end_group
+from worker.places import make_places, places_of
 from worker.stage_process import END_OF_LOG
 
 _log = logging.getLogger("nerfworks.worker")
@@ -57,6 +58,8 @@ class StageProcess:
         self.contained: Containment | None = None
         self._wanted_memory = False  # its last lines said that there was none
         self._oom_before = oom_kills()
+        make_places(plan.write)
+        self._places = places_of(plan.write)
         message_read, message_write = os.pipe()
         life_read, self._life_write = os.pipe()
         try:
@@ -91,6 +94,10 @@ class StageProcess:
     def is_alive(self) -> bool:
         """Whether the child still runs."""
         return self._process.poll() is None
+
+    def is_in_place(self) -> bool:
+        """Whether the folders that the child may write to are still those that it was let into."""
+        return places_of(self._places) == self._places
 
     def peak_bytes(self) -> int | None:
         """The most memory the child held since its run began; None where the system does not say,

@@ -228,7 +228,15 @@ class Runner:
             uploader.close(finish=finish, timeout_s=limit_s)
         reached("run.done")
         folder = workspace.stage(stage.name)
-        upload_folder(self._store, folder, prefix, guard, workers=workers, step="publish")
+        upload_folder(
+            self._store,
+            folder,
+            prefix,
+            guard,
+            workers=workers,
+            step="publish",
+            expected=manifest["files"],
+        )
         laps.end("store_s")
         return {**manifest, "timings": {**manifest["timings"], **laps.seconds}}
 
@@ -261,10 +269,12 @@ class Runner:
         return None if process is None else process.contained
 
     def _ensure_process(self) -> StageProcess:
-        if self._process is None or not self._process.is_alive():
+        process = self._process
+        if process is None or not process.is_alive() or not process.is_in_place():
             self.close()
-            self._process = StageProcess(self._registry_name, self._plan, self._preload)
-        return self._process
+            process = StageProcess(self._registry_name, self._plan, self._preload)
+            self._process = process
+        return process
 
     def _run_in_process(
         self,
@@ -310,6 +320,8 @@ class Runner:
         except StageFailedError as error:
             if error.error["code"] in ("internal_error", "gpu_lost"):
                 self.close()  # its state cannot be trusted, or its GPU answers it no more
+            if not workspace.job_file.is_file():  # somebody deleted the folder under it
+                raise StageFailedError({**error.error, "retryable": True}) from error
             raise
         finally:
             process.finish_log(LOG_END_S if process.is_alive() else 0.0)

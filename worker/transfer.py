@@ -41,13 +41,24 @@ def _run_all(jobs: Iterable[Callable[[], None]], workers: int) -> None:
 
 
 def upload_folder(
-    store: ObjectStore, folder: Path, prefix: str, guard: Guard, *, workers: int, step: str
+    store: ObjectStore,
+    folder: Path,
+    prefix: str,
+    guard: Guard,
+    *,
+    workers: int,
+    step: str,
+    expected: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """Upload all files below a folder; its manifest, if any, last.
 
     Links are passed over: a stage could name a file by one that is closed to it and open to us.
-    step: the operation in `storage.steps` that this is.
+    step: the operation in `storage.steps` that this is. expected: `{path, bytes}` of files that
+    must be there. Raises FileNotFoundError where somebody has cleaned up meanwhile.
     """
+    for item in expected:
+        if not _has_size(folder / item["path"], item["bytes"]):
+            raise FileNotFoundError(f"{folder / item['path']} is gone, or shorter than it was")
 
     def check(count: int) -> None:
         guard()
@@ -112,12 +123,21 @@ def _is_here(workspace: Workspace, wanted: StageInput) -> bool:
         local: dict[str, Any] = workspace.manifest(wanted.name)
     except (OSError, ValueError):
         return False
-    return all(local.get(key) == wanted.manifest.get(key) for key in ("fingerprint", "content"))
+    if any(local.get(key) != wanted.manifest.get(key) for key in ("fingerprint", "content")):
+        return False
+    folder = workspace.stage(wanted.name)
+    return all(
+        _has_size(folder / item["path"], item["bytes"]) for item in wanted.manifest.get("files", [])
+    )
+
+
+def _has_size(path: Path, num_bytes: int) -> bool:
+    """Whether the file is there, as long as it was: disks are cleaned up, and fill."""
+    return path.is_file() and path.stat().st_size == num_bytes
 
 
 def _is_capture_here(workspace: Workspace, work: StageWork) -> bool:
-    path = workspace.capture_file
-    return path.is_file() and path.stat().st_size == work.capture_bytes
+    return _has_size(workspace.capture_file, work.capture_bytes)
 
 
 def missing_bytes(
@@ -159,12 +179,23 @@ def fetch_inputs(
 
 
 def fetch_capture(store: ObjectStore, workspace: Workspace, work: StageWork, guard: Guard) -> None:
-    """Bring the uploaded bytes."""
+    """Bring the uploaded bytes. Raises ObjectStoreError where others come.
+
+    Half of a capture would pass for one that is of no use, and the job would fail for good.
+    """
     with folder_lock(workspace.root, "fetch-capture", FETCH_LOCK_S):
         path = workspace.capture_file
-        if not _is_capture_here(workspace, work):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            store.get_file(work.capture_key, path, lambda count: guard())
+        if _is_capture_here(workspace, work):
+            return
+        temporary = path.with_name(f".fetch-{secrets.token_hex(4)}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            store.get_file(work.capture_key, temporary, lambda count: guard())
+            if file_sha256(temporary) != work.capture_sha256:
+                raise ObjectStoreError(f"{work.capture_key} is damaged.")
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def write_job_file(workspace: Workspace, work: StageWork) -> None:

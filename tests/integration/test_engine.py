@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -258,6 +259,33 @@ def test_a_frozen_worker_loses_its_stage_to_another_in_the_same_home(
         engine.close()
 
 
+def test_jobs_succeed_though_somebody_deletes_the_folder_of_jobs(engine: Engine) -> None:
+    """Between two jobs, and under a stage that runs: its process must be let into the new one."""
+    engine.start_worker("w1")
+    first = engine.wait_for(engine.submit({}), "succeeded", "failed")
+    assert first.state == "succeeded", first.error
+    work = engine.folder / "home" / "work"
+
+    def delete() -> None:
+        aside = work.rename(
+            work.with_name(f"deleted-{time.monotonic_ns()}")
+        )  # at once: the worker cleans up there, too
+        shutil.rmtree(aside, ignore_errors=True)
+
+    delete()
+    go_on = engine.folder / "home" / "cache" / "go on"
+    job_id = engine.submit({"train": {"until": str(go_on)}})
+    engine.wait(lambda: engine.notes("train start")[1:])
+    delete()
+    go_on.touch()
+    job = engine.wait_for(job_id, "succeeded", "failed", timeout_s=60)
+    assert job.state == "succeeded", job.error
+    assert engine.outcomes(job_id, "train") == ["error", "succeeded"]
+    for stage in STAGES:
+        prefix = engine.stage(job_id, stage.name).output_prefix
+        assert f"{prefix}deep/result ä.txt" in list(engine.store.list(str(prefix)))
+
+
 def test_sigterm_gives_the_stage_back_without_counting_and_ends_in_seconds(engine: Engine) -> None:
     worker = engine.start_worker("w1")
     plan = {"steps": 40, "step_s": 0.1, "save_at_shutdown": True}
@@ -302,6 +330,29 @@ def test_work_goes_on_while_redis_is_gone(engine: Engine, redis_server: RedisSer
     redis_server.kill()
     job_id = engine.submit(SLOW | {"train": {"steps": 5, "step_s": 0.1}})
     assert engine.wait_for(job_id, "succeeded", "failed", timeout_s=60).state == "succeeded"
+
+
+@pytest.mark.parametrize(
+    ("setting", "refuses", "takes"), [("maxmemory", "1", "0"), ("min-replicas-to-write", "1", "0")]
+)
+def test_a_redis_that_refuses_to_write_costs_no_worker_and_no_attempt(
+    engine: Engine, redis_server: RedisServer, setting: str, refuses: str, takes: str
+) -> None:
+    """Full, or as one whose disk is full or whose replicas are gone: it refuses what writes, and
+    taking a message does."""
+    worker = engine.start_worker()
+    job_id = engine.submit({"train": {"steps": 40, "step_s": 0.1}})
+    engine.wait(lambda: engine.stage(job_id, "train").progress > 0)
+    redis_server.configure(setting, refuses)
+    beside = engine.submit({})
+    job = engine.wait_for(job_id, "succeeded", "failed")
+    assert job.state == "succeeded", job.error
+    assert engine.outcomes(job_id, "train") == ["succeeded"]
+    assert engine.wait_for(beside, "succeeded", "failed", timeout_s=60).state == "succeeded"
+    redis_server.configure(setting, takes)
+    later = engine.submit({})
+    assert engine.wait_for(later, "succeeded", "failed").state == "succeeded"
+    assert worker.poll() is None
 
 
 def test_a_worker_hears_the_bell_again_after_redis_was_killed_and_started(

@@ -24,6 +24,7 @@ from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.outcomes import crash_of, failure_of
 from worker.transfer import (
     download_folder,
+    fetch_capture,
     fetch_inputs,
     missing_bytes,
     restore_checkpoint,
@@ -56,7 +57,7 @@ def stage_folder(root: Path, text: str = "result") -> tuple[Path, dict[str, Any]
 
 def work_with(manifest: dict[str, Any]) -> StageWork:
     inputs = {"train": StageInput("train", "p/", manifest)}
-    return StageWork("k", 0, "f", "video", 0, {}, inputs, None)
+    return StageWork("k", 0, "", "f", "video", 0, {}, inputs, None)
 
 
 def test_the_manifest_is_uploaded_last(store: LocalObjectStore, tmp_path: Path) -> None:
@@ -119,6 +120,56 @@ def test_a_damaged_input_is_not_accepted(store: LocalObjectStore, tmp_path: Path
     with pytest.raises(ObjectStoreError, match="damaged"):
         fetch_inputs(store, workspace, ("train",), work_with(manifest), no_guard, workers=2)
     assert not workspace.stage("train").exists()
+
+
+@pytest.mark.parametrize("came", ["wholf", "who"])
+def test_a_damaged_capture_is_not_accepted(
+    store: LocalObjectStore, tmp_path: Path, came: str
+) -> None:
+    """It would pass for one that is of no use, and the job would fail for good."""
+    workspace = Workspace(tmp_path / "job")
+    digest = hashlib.sha256(b"whole").hexdigest()
+    work = replace(work_with({}), capture_key="c/k", capture_bytes=5, capture_sha256=digest)
+    store.path_of("c").mkdir(parents=True)
+    store.path_of("c/k").write_text(came)
+    with pytest.raises(ObjectStoreError, match="damaged"):
+        fetch_capture(store, workspace, work, no_guard)
+    assert not list(workspace.capture_file.parent.iterdir())
+    store.path_of("c/k").write_text("whole")
+    fetch_capture(store, workspace, work, no_guard)
+    assert workspace.capture_file.read_text() == "whole"
+
+
+@pytest.mark.parametrize("left", ["res", None])
+def test_an_input_that_somebody_cleaned_up_comes_again(
+    store: LocalObjectStore, tmp_path: Path, left: str | None
+) -> None:
+    folder, manifest = stage_folder(tmp_path)
+    upload_folder(store, folder, "p/", no_guard, workers=2, step="publish")
+    workspace = Workspace(tmp_path / "job")
+    workspace.root.mkdir()
+    reads, work = ("train",), work_with(manifest)
+    fetch_inputs(store, workspace, reads, work, no_guard, workers=2)
+    here = workspace.stage("train") / "deep" / "file.txt"
+    here.unlink() if left is None else here.write_text(left)
+    assert missing_bytes(workspace, reads, work, wants_capture=False) == len("result")
+    fetch_inputs(store, workspace, reads, work, no_guard, workers=2)
+    assert here.read_text() == "result"
+
+
+def test_a_result_of_which_a_file_is_gone_is_not_published(
+    store: LocalObjectStore, tmp_path: Path
+) -> None:
+    folder, manifest = stage_folder(tmp_path)
+    (folder / "deep" / "file.txt").unlink()
+    with pytest.raises(FileNotFoundError, match="gone"):
+        upload_folder(
+            *(store, folder, "p/", no_guard),
+            workers=1,
+            step="publish",
+            expected=manifest["files"],
+        )
+    assert list(store.list("p/")) == []
 
 
 def test_a_guard_ends_a_transfer_and_leaves_nothing(
