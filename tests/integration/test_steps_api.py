@@ -32,7 +32,14 @@ from tests.histories import check_can_go_on, check_history
 from tests.integration.aftermath import check_only_what_is_named
 from tests.integration.victims import HOLD_S, api_that_dies, wait_for_death
 from tests.services import free_port
-from tests.unit.api.conftest import KEY, Service, serving, settings_for, zip_of_pictures
+from tests.unit.api.conftest import (
+    KEY,
+    Service,
+    run_stage,
+    serving,
+    settings_for,
+    zip_of_pictures,
+)
 
 pytestmark = pytest.mark.services
 AUTHORISED = {"Authorization": f"Bearer {KEY}"}
@@ -44,6 +51,8 @@ KILLS = (
     ("upload", "create.committed"),
     ("submit", "create.commit"),
     ("submit", "create.committed"),
+    ("export", "create.commit"),
+    ("export", "create.committed"),
     ("cancel", "cancel.commit"),
     ("cancel", "cancel.committed"),
     ("delete job", "delete.commit"),
@@ -62,6 +71,11 @@ LOSES = (
     ("submit", "hold.committed"),
     ("submit", "create.commit"),
     ("submit", "create.committed"),
+    ("export", "hold.committed"),
+    ("export", "create.commit"),
+    ("export", "create.committed"),
+    ("delete export", "delete.commit"),
+    ("delete export", "delete.committed"),
     ("retry", "create.commit"),
     ("retry", "create.committed"),
     ("cancel", "cancel.commit"),
@@ -112,6 +126,17 @@ class Call:
         self.headers = {"Idempotency-Key": secrets.token_hex(8)}
         self.capture = "" if what == "upload" else self.upload()
         self.job = ""
+        if what in ("export", "delete export"):
+            parent = service.job(self.capture)
+            self.parent = parent["id"]
+            for stage in parent["stages"]:
+                if stage["state"] != "skipped":
+                    run_stage(service.services, self.parent, stage["name"], {"a": b"made"})
+        if what == "delete export":
+            self.job = service.http.post(self.exports, json={"kind": "mesh"}).json()["id"]
+            run_stage(service.services, self.job, "mesh", {"mesh.glb": b"made anew"})
+            self.root = job_root(DEFAULT_TENANT, self.job)
+            assert list(service.services.store.list(self.root))
         if what in ("cancel", "delete job", "retry"):
             self.job = service.job(self.capture)["id"]
             self.root = job_root(DEFAULT_TENANT, self.job)
@@ -121,6 +146,11 @@ class Call:
             service.services.store.put_file(self.result, made)
         if what == "retry":
             assert service.http.post(f"/v1/jobs/{self.job}/cancel").status_code == 202
+
+    @property
+    def exports(self) -> str:
+        """Where the exports of the finished job are."""
+        return f"/v1/jobs/{self.parent}/exports"
 
     def upload(self) -> str:
         found: str = self.service.upload(self.content, self.filename)["id"]
@@ -136,7 +166,9 @@ class Call:
             return post(f"/v1/jobs/{self.job}/cancel")
         if self.what == "retry":
             return post(f"/v1/jobs/{self.job}/retry")
-        if self.what == "delete job":
+        if self.what == "export":
+            return post(self.exports, json={"kind": "mesh"})
+        if self.what in ("delete job", "delete export"):
             return http.delete(f"/v1/jobs/{self.job}")
         return http.delete(f"/v1/captures/{self.capture}")
 
@@ -153,15 +185,17 @@ class Call:
     def check(self, answer: httpx.Response, done_before: bool) -> None:
         """done_before: whether an earlier sending of the call had been recorded."""
         services = self.service.services
-        expected = {"upload": 201, "submit": 202, "cancel": 202, "retry": 202}
+        expected = {"upload": 201, "submit": 202, "export": 202, "cancel": 202, "retry": 202}
         status = expected.get(self.what, 404 if done_before else 204)
         assert answer.status_code == status, answer.text
-        if self.what in ("upload", "submit", "retry"):
+        if self.what in ("upload", "submit", "export", "retry"):
             assert answer.headers.get("Idempotent-Replayed") == ("true" if done_before else None)
         with services.database.read_scope() as session:
             named = select(Capture).where(Capture.filename == self.filename)
             (capture,) = session.scalars(named).all()
-            jobs = session.scalars(select(Job).where(Job.capture_id == capture.id)).all()
+            jobs = session.scalars(
+                select(Job).where(Job.capture_id == capture.id).order_by(Job.created_at)
+            ).all()
             for job in jobs:
                 check_history(session, job.id)
                 check_can_go_on(session, job.id)
@@ -169,6 +203,8 @@ class Call:
         found = [(job.state, job.generation) for job in jobs]
         wanted = {
             "submit": [("queued", 1)],
+            "export": [("succeeded", 1), ("queued", 1)],
+            "delete export": [("succeeded", 1)],
             "cancel": [("cancelled", 1)],
             "retry": [("queued", 2)],
         }
@@ -182,7 +218,10 @@ class Call:
         assert isinstance(services.store, LocalObjectStore)
         while drain_deletions(services.database, services.store):
             pass
-        if self.what == "delete job":
+        if self.what == "export":
+            made = {job.id: job for job in jobs}[answer.json()["id"]]
+            assert (made.parent_id, made.state) == (self.parent, "queued")
+        if self.what in ("delete job", "delete export"):
             assert not list(services.store.list(self.root))
         check_only_what_is_named(services.database, services.store)
         sweep(services.settings.staging_dir)  # an API does so when it starts
