@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from api.client.client import Client
 from deploy.embedded import Embedded, free_port
 from deploy.supervisor import Supervisor
+from pipelines.nerf.engines.cpu.parts.runtime import CACHE_FOLDER
 from tests.samples import sample_clip
 
 
@@ -35,8 +37,15 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Empty at first: the first job compiles its kernels, those after it find them there."""
-    return tmp_path_factory.mktemp("cache")
+    """One for all services of a run: the first job compiles its kernels, those after it find them.
+
+    What other tests, or an earlier run, have compiled of the same sources is there already; that a
+    contained process compiles from nothing is tested in tests/unit/worker/test_containment.py.
+    """
+    folder = tmp_path_factory.mktemp("cache")
+    known = folder / "numba" / CACHE_FOLDER.name
+    shutil.copytree(CACHE_FOLDER, known, ignore=shutil.ignore_patterns("lock", "*.lock", "*.tmp*"))
+    return folder
 
 
 @pytest.fixture

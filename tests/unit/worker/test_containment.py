@@ -219,6 +219,14 @@ def test_what_compiles_kernels_is_contained_and_has_a_temporary_folder(nosy: Nos
     if landlock.version() >= landlock.OLDEST:
         done = run(f"open({str(nosy.home / 'secrets.json')!r})")
         assert "PermissionError" in done.stderr
+    kept = Path(nosy.plan.environment["NUMBA_CACHE_DIR"])
+    assert not list(kept.rglob("*.nbc"))
+    done = run(
+        "import numpy as np; from pipelines.nerf.engines.cpu.parts.intervals import spread_edges;"
+        "edges = np.zeros(3, np.float32); spread_edges(edges, 2, 0.1, 1.0, edges)"
+    )
+    assert done.returncode == 0, done.stderr
+    assert list(kept.rglob("*.nbc")), "what was compiled is kept for the next process"
 
 
 @linux
