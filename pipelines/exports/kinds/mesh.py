@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -68,8 +69,16 @@ class MeshOptions(CropOptions, TextureOptions):
         256,
         ge=32,
         le=2048,
-        description="Voxels along the longest side of the subject; fewer where memory has no room "
-        "for so many, which the report tells.",
+        description="Voxels along the longest side of what lies within max_distance; fewer where "
+        "memory has no room for so many, which the report tells.",
+    )
+    fine_distance: float = Field(
+        1.0,
+        ge=0.0,
+        le=100.0,
+        description="Within so many camera distances of what the cameras look at, voxels are half "
+        "as large, if half of what they see is there, and unless a rendered pixel is larger; 0 for "
+        "the same everywhere.",
     )
     num_views: int = Field(
         0, ge=0, le=5000, description="Training views fused, evenly picked; 0 for all."
@@ -91,8 +100,8 @@ class MeshOptions(CropOptions, TextureOptions):
         200_000,
         ge=100,
         le=20_000_000,
-        description="The subject is simplified to this, what lies beyond to a quarter of it a "
-        "shell.",
+        description="What lies within fine_distance is simplified to this, what lies within "
+        "max_distance too, and what lies beyond to a quarter of it a shell.",
     )
     triangles: int = Field(
         0,
@@ -141,7 +150,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.placement import placement_of
     from pipelines.exports.reduction import reduced
     from pipelines.exports.surface.refinement import refined
-    from pipelines.exports.surface.shells import Shell, affordable, find_shells, fuse_shells
+    from pipelines.exports.surface.shells import Subject, affordable, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
     from pipelines.exports.texture.bake import painted
     from pipelines.scene.depth_views import Pinhole
@@ -150,23 +159,24 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     place = placement_of(options.frame, scene.cameras)
     frame = place.frame(options.up_axis)
     ctx.progress(0.0, "looking for the scene's bounds")
+    images = scene.training_images(options.num_views)
+    lenses = [Pinhole.of(scene.lens_of(image), options.render_long_side_px) for image in images]
     probes = scene.probe_views(ctx.check_cancelled)
     shells = find_shells(
         lambda distance: scene.bounds(distance, ctx.check_cancelled, probes),
         options.max_distance,
         reach_of(options),
         options.resolution,
+        Subject(options.fine_distance, max(1.0 / lens.fl_x for lens in lenses), probes),
     )
     if not shells:
         raise _empty("no ray of the training views met a surface")
     crop = place.crop(crop_of(options.crop))
     surface_in(crop, probes, shells[-1].bounds, "mesh")
-    kept = [(narrowed(shell.bounds, crop), shell.voxel) for shell in shells]
-    shells = [Shell(bounds, voxel) for bounds, voxel in kept if bounds is not None]
-    images = scene.training_images(options.num_views)
+    kept = [(shell, narrowed(shell.bounds, crop)) for shell in shells]
+    shells = [replace(shell, bounds=bounds) for shell, bounds in kept if bounds is not None]
     known = known_depths(ctx.workspace, options.use_depth_maps)
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
-        lenses = [Pinhole.of(scene.lens_of(image), options.render_long_side_px) for image in images]
         store = render_views(scene, images, lenses, Path(folder), ctx, _RENDER_SHARE, known)
         asked, shells = (
             shells,
@@ -198,6 +208,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             photos,
             _part_of(ctx, "refining", _FUSE_SHARE, _REFINE_SHARE),
             flat=options.flatten,
+            noise=max(shell.voxel for shell in shells if not shell.is_far),
         )
         del photos
     whole, mesh = mesh, cropped(mesh, crop)
@@ -327,7 +338,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=8,
+    version=9,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

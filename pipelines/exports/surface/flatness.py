@@ -8,11 +8,11 @@ neighbours share:
 
     min_d  sum_i t_i (d_i - a_i)^2 + e d_i^2 + s sum_edges (d_i - d_j)^2
 
-with a the photos' answer and t its trust: a plain wall (t = 0) becomes plane, a textured one smooth
-but as bent as its pictures say, and what stands out by more than half an edge in the pictures, or
-is the rim of a plane, stays as it is. Sources: Schnabel, Wahl, Klein, "Efficient RANSAC for
-Point-Cloud Shape Detection", CGF 2007; Torr, Zisserman, "MLESAC", CVIU 2000 (a hypothesis is worth
-more the nearer its points are).
+with a the photos' answer and t its trust, the more the finer their pixels are: a plain wall (t = 0)
+becomes plane, a textured one smooth but as bent as its pictures say, and what stands out by more
+than half an edge in the pictures, or is the rim of a plane, stays as it is. Sources: Schnabel,
+Wahl, Klein, "Efficient RANSAC for Point-Cloud Shape Detection", CGF 2007; Torr, Zisserman,
+"MLESAC", CVIU 2000 (a hypothesis is worth more the nearer its points are).
 
 Symbols: V vertices, F faces, P planes (n, d) with n . X = d, n of length 1.
 """
@@ -62,6 +62,9 @@ _RELIEF, _RELIEF_TRUST = 0.5, 0.25
 _SURE, _SLACK = 0.3, 1.5
 """Trust in the photos' answer, and half pixels that such a vertex may leave it by."""
 _SMOOTH, _TO_PLANE = 10.0, 0.005
+_PIXEL, _FINEST = 0.3, 5.0
+"""Half a pixel of the photos, in edges, of which an answer has its trust as weight; where photos
+are finer it has more, up to so many times, squared."""
 _HOLD, _MOVE = 3.0, 30.0
 _ITERATIONS, _TOLERANCE = 200, 1e-4
 
@@ -95,7 +98,7 @@ def find_flat_parts(
     poll: called now and then; may raise.
     """
     normals = unit_normals(rings.spread(rings.normals(vertices), _NORMAL_ROUNDS))
-    lengths = rings.edge_lengths(vertices)
+    lengths = rings.scale(vertices)
     planes = _planes(vertices, normals, lengths, rings.areas(vertices), poll)
     nowhere = np.full(len(vertices), NOWHERE, np.intp)
     if len(planes) == 0:
@@ -120,7 +123,7 @@ def flattened(
         return vertices
     normals = parts.planes[np.maximum(plane_of, 0), :3]
     away = (vertices * normals).sum(axis=1) - parts.planes[np.maximum(plane_of, 0), 3]
-    lengths = rings.edge_lengths(vertices)
+    lengths = rings.scale(vertices)
     if answers is None:
         on = on & ~_in_relief(away, on.astype(np.float64), on, lengths, rings)
         kept = np.zeros(len(vertices))
@@ -128,7 +131,9 @@ def flattened(
         wanted = away + answers.offset * (rings.normals(vertices) * normals).sum(axis=1)
         trust = np.where(on, answers.trust, 0.0)
         on = on & ~_in_relief(wanted, trust, on, lengths, rings)
-        kept = _shared(wanted, np.where(on, trust, 0.0), np.where(on, plane_of, NOWHERE), rings)
+        exact = _PIXEL * lengths / np.maximum(answers.half_pixel, 1e-12)
+        weights = np.where(on, trust * np.clip(exact, 1.0, _FINEST) ** 2, 0.0)
+        kept = _shared(wanted, weights, np.where(on, plane_of, NOWHERE), rings)
         slack = np.where(trust > _SURE, _SLACK * answers.half_pixel, np.inf)
         kept = np.clip(kept, wanted - slack, wanted + slack)
     moves = np.where(on[:, None], (kept - away)[:, None] * normals, 0.0)

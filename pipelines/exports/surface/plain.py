@@ -43,7 +43,7 @@ def with_plain_parts(
     """
     plain = _plain(rings, colors, trust)
     facing = unit_normals(rings.spread(rings.normals(vertices), _NORMAL_ROUNDS))
-    lengths = np.maximum(rings.edge_lengths(vertices), 1e-12)
+    lengths = rings.scale(vertices)
     planes, plane_of = list(parts.planes), parts.plane_of.copy()
     for normal in _directions(parts.planes):
         free = (plane_of == NOWHERE) & plain & (np.abs(facing @ normal) > _FACING)

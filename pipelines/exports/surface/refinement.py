@@ -58,17 +58,19 @@ def refined(
     on_progress: Callable[[float], None] = lambda done: None,
     *,
     flat: bool = True,
+    noise: float = 0.0,
 ) -> TriangleMesh:
     """The mesh with its vertices moved and without what no two views show.
 
     Colours stay. views: undistorted grey photos with their cameras, in the mesh's world. flat:
-    whether what is about plane becomes plane. on_progress: told the share that is done; may raise.
+    whether what is about plane becomes plane. noise: the edge whose parts bumps are, where edges
+    are shorter; world units. on_progress: told the share that is done; may raise.
     """
     if len(mesh.faces) == 0 or not views:
         return mesh
     origin = mesh.vertices.mean(axis=0)
     vertices = mesh.vertices - origin
-    rings = MeshRings(mesh.faces, len(vertices))
+    rings = MeshRings(mesh.faces, len(vertices), noise)
     if flat:
         parts = find_flat_parts(vertices, rings, lambda: on_progress(0.0))
         vertices = flattened(vertices, parts, rings)

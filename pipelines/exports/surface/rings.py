@@ -17,10 +17,11 @@ Floats = NDArray[np.float64]
 
 
 class MeshRings:
-    """Who is whose neighbour. faces: [F, 3]."""
+    """Who is whose neighbour. faces: [F, 3]. noise: the least length that `scale` tells."""
 
-    def __init__(self, faces: NDArray[np.int32], num_vertices: int) -> None:
+    def __init__(self, faces: NDArray[np.int32], num_vertices: int, noise: float = 0.0) -> None:
         self.faces = faces
+        self.noise = noise
         self.num_vertices = num_vertices
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
@@ -55,6 +56,10 @@ class MeshRings:
         length = np.linalg.norm(vertices[pairs.row] - vertices[pairs.col], axis=1)
         mean: Floats = np.bincount(pairs.row, length, len(vertices)) / np.maximum(self.degree, 1.0)
         return mean
+
+    def scale(self, vertices: Floats) -> Floats:
+        """[V]: what bumps are measured in: the edges, where they are not shorter than noise is."""
+        return np.maximum(self.edge_lengths(vertices), max(self.noise, 1e-12))
 
     def crossed(self, vertices: Floats) -> tuple[Floats, Floats]:
         """Sums over the faces around each vertex: of twice their area times their normal [V, 3],

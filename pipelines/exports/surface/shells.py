@@ -1,7 +1,9 @@
-"""A scene in shells: fine around what was filmed, coarser beyond, up to where cameras saw.
+"""A scene in shells: finest around what was filmed, coarser beyond, up to where cameras saw.
 
-The innermost shell is the scene's bounds at `max_distance`. Each further one reaches three times as
-far and has voxels three times as large, so that from the cameras all of them look alike.
+One shell is the scene's bounds at `max_distance`, with voxels of the asked resolution. Within it is
+one for the subject, if half of what cameras see is that, with voxels half as large: of what lies
+within two camera distances, the thing that is walked round is a tenth. Each further one reaches
+three times as far and has voxels three times as large, so that from the cameras all look alike.
 """
 
 from __future__ import annotations
@@ -15,23 +17,43 @@ from pipelines.exports.surface.clean import clean
 from pipelines.exports.surface.poisson import reconstruct
 from pipelines.exports.surface.tsdf import Blocks, affordable_blocks, fuse
 from pipelines.scene.bounds import SceneBounds
-from pipelines.scene.depth_views import ViewStore
+from pipelines.scene.depth_views import DepthView, ViewStore
 
 Method = Literal["tsdf", "poisson"]
 REACH = 3.0
 _MIN_GROWTH = 1.2
 """What is hardly larger than the shell in it shows nothing new and is left out."""
+_FINER = 2.0
+_LEAST_FINER = 1.3
+"""A subject whose voxels would be hardly smaller than those around it needs no shell."""
+_LEAST_SEEN = 0.5
+"""Of what cameras see, for a subject. Of things that are walked round 0.54 to 0.97 is; 0.25 of a
+room, whose walls got holes and bumps from finer voxels."""
 _OUTER_FACES = 0.25
 _FUSE_SHARE = 0.75
 
 
 @dataclass(frozen=True)
 class Shell:
-    """bounds: with all that inner shells have. voxel: world units. blocks: where they are known."""
+    """bounds: with all that inner shells have. voxel: world units. is_far: whether it lies beyond
+    `max_distance`. blocks: where they are known.
+    """
 
     bounds: SceneBounds
     voxel: float
+    is_far: bool = False
     blocks: Blocks | None = None
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What may have finer voxels. max_distance: in camera distances. pixel: what one of the fused
+    views covers at distance 1. views: some of them, small ones will do.
+    """
+
+    max_distance: float
+    pixel: float
+    views: Sequence[DepthView]
 
 
 def find_shells(
@@ -39,23 +61,40 @@ def find_shells(
     max_distance: float,
     far_distance: float,
     resolution: int,
+    subject: Subject | None = None,
 ) -> list[Shell]:
     """The shells, innermost first; none where there is no surface.
 
     bounds_at: the bounds that reach so many camera distances. resolution: voxels along the longest
-    side of the innermost one.
+    side of the one at `max_distance`. subject: what may have voxels half as large.
     """
     inner = bounds_at(max_distance)
     if inner is None:
         return []
     voxel, reach = inner.longest_side / resolution, max_distance
     shells = [Shell(inner, voxel)]
+    if subject is not None and 0.0 < subject.max_distance < max_distance:
+        bounds = bounds_at(subject.max_distance)
+        fine = max(voxel / _FINER, subject.pixel * inner.distance)
+        if (
+            bounds
+            and _LEAST_FINER * fine <= voxel
+            and seen_share(subject.views, bounds) >= _LEAST_SEEN
+        ):
+            shells.insert(0, Shell(bounds, fine))
     while reach < far_distance:
         reach = min(REACH * reach, far_distance)
         bounds = bounds_at(reach)
         if bounds and bounds.longest_side >= _MIN_GROWTH * shells[-1].bounds.longest_side:
-            shells.append(Shell(bounds, voxel * reach / max_distance))
+            shells.append(Shell(bounds, voxel * reach / max_distance, is_far=True))
     return shells
+
+
+def seen_share(views: Sequence[DepthView], bounds: SceneBounds) -> float:
+    """How much of the surfaces that views see lies within bounds, [0, 1]."""
+    seen = sum(int((view.z_depth > 0.0).sum()) for view in views)
+    within = sum(int(bounds.mask(view).sum()) for view in views)
+    return within / max(seen, 1)
 
 
 def affordable(
@@ -88,8 +127,9 @@ def fuse_shells(
 ) -> TriangleMesh:
     """All shells fused and cleaned, as one mesh; may be without vertices.
 
-    max_faces: of the innermost shell; each other one has at most a quarter of it. on_progress: told
-    the share that is done; may raise. method: how a shell's surface is made of the views.
+    max_faces: of each shell up to `max_distance`; those beyond have at most a quarter of it.
+    on_progress: told the share that is done; may raise. method: how a shell's surface is made of
+    the views.
     """
     pieces = []
     for index, shell in enumerate(shells):
@@ -106,7 +146,7 @@ def fuse_shells(
             fused = fuse(views, shell.bounds, shell.voxel, on_fused, shell.blocks)
         if index:
             fused = _outside(fused, shells[index - 1].bounds, shell.voxel)
-        faces = max_faces if index == 0 else max(100, int(_OUTER_FACES * max_faces))
+        faces = max(100, int(_OUTER_FACES * max_faces)) if shell.is_far else max_faces
         pieces.append(clean(fused, shell.bounds, faces, on_cleaned))
         on_cleaned(1.0)
     return joined([piece for piece in pieces if len(piece.faces)])

@@ -160,7 +160,7 @@ def test_a_mesh_for_which_memory_has_no_room_is_coarser_and_says_so(
 ) -> None:
     fine = tiny_job.run(job, "mesh", refine="none", texture="none")["summary"]
     assert fine["coarser"] is None
-    monkeypatch.setattr(tsdf, "MOST_BLOCKS", 100)
+    monkeypatch.setattr(tsdf, "MOST_BLOCKS", 40)
     coarse = tiny_job.run(job, "mesh", refine="none", texture="none")["summary"]
     assert coarse["coarser"]["asked_voxel"] == fine["voxel"]
     assert coarse["voxel"] > 1.2 * fine["voxel"]

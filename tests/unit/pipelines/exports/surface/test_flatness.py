@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from pipelines.exports.surface.flatness import NOWHERE, Answers, find_flat_parts, flattened
 from pipelines.exports.surface.rings import MeshRings
@@ -154,3 +155,16 @@ def test_it_can_be_stopped_while_it_looks() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         find_flat_parts(bumpy, rings, stop)
+
+
+def test_bumps_are_measured_by_what_made_them_not_by_finer_edges() -> None:
+    """Bumps of four edges' width and more than one's height, as a mesh of half the edges has."""
+    points = sheet(0 * X, X, Y) - 0.5 * SIDE * STEP * (X + Y)
+    bumps = gaussian_filter(np.random.default_rng(0).normal(size=(SIDE, SIDE)), 2.0).ravel()
+    points[:, 2] += 1.2 * STEP * bumps / bumps.std()
+    faces = faces_of(SIDE)
+    assert (find_flat_parts(points, MeshRings(faces, len(points))).plane_of == NOWHERE).all()
+    told = MeshRings(faces, len(points), noise=2.5 * STEP)
+    flat = flattened(points, find_flat_parts(points, told), told)
+    assert tilt_deg(points, told, Z) > 10.0
+    assert tilt_deg(flat, told, Z) < 1.0

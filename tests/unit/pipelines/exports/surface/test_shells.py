@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.exports.mesh import TriangleMesh
-from pipelines.exports.surface.shells import Shell, find_shells, fuse_shells
+from pipelines.exports.surface.shells import Shell, Subject, find_shells, fuse_shells, seen_share
 from pipelines.scene.bounds import bounds_of_views
 from pipelines.scene.depth_views import DepthView, Pinhole, ViewStore
 from tests.unit.pipelines.scene.synthetic_views import ring, sphere_view
@@ -37,11 +37,21 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> ViewStore:
     return store
 
 
-def shells_of(views: ViewStore, far_distance: float) -> list[Shell]:
+def without_walls(view: DepthView) -> DepthView:
+    return replace(view, z_depth=np.where(view.z_depth < 5.0, view.z_depth, 0.0))
+
+
+def shells_of(
+    views: ViewStore, far_distance: float, fine_distance: float = 0.0, pixel: float = 0.0
+) -> list[Shell]:
     seen = list(views)
     poses = np.stack([view.world_from_camera for view in seen])
     return find_shells(
-        lambda distance: bounds_of_views(seen, poses, distance), 1.5, far_distance, 64
+        lambda distance: bounds_of_views(seen, poses, distance),
+        1.5,
+        far_distance,
+        64,
+        Subject(fine_distance, pixel, [without_walls(view) for view in seen]),
     )
 
 
@@ -62,6 +72,58 @@ def test_voxels_grow_with_the_reach(views: ViewStore) -> None:
 def test_there_is_no_shell_where_there_is_nothing_new(views: ViewStore) -> None:
     assert len(shells_of(views, 1.5)) == 1
     assert len(shells_of(views, 1000.0)) == len(shells_of(views, 13.0))
+
+
+def test_the_subject_has_voxels_half_as_large(views: ViewStore) -> None:
+    plain, fine = shells_of(views, 12.0), shells_of(views, 12.0, fine_distance=1.0)
+    assert fine[0].voxel == pytest.approx(0.5 * plain[0].voxel)
+    assert fine[0].bounds.radius < fine[1].bounds.radius
+    assert [shell.voxel for shell in fine[1:]] == [shell.voxel for shell in plain]
+    assert [shell.is_far for shell in fine[:2]] == [False, False]
+    assert all(shell.is_far for shell in fine[2:])
+
+
+def test_no_voxel_is_much_smaller_than_a_pixel(views: ViewStore) -> None:
+    plain = shells_of(views, 12.0)
+    distance = plain[0].bounds.distance
+    pixel = 0.7 * plain[0].voxel
+    fine = shells_of(views, 12.0, fine_distance=1.0, pixel=pixel / distance)
+    assert fine[0].voxel == pytest.approx(pixel)
+    hardly = shells_of(views, 12.0, fine_distance=1.0, pixel=0.9 * plain[0].voxel / distance)
+    assert [shell.voxel for shell in hardly] == [shell.voxel for shell in plain]
+
+
+def test_a_room_has_no_subject(views: ViewStore) -> None:
+    """Where most of what cameras see is far walls, those are what people came for."""
+    seen, plain = list(views), shells_of(views, 12.0)
+    share = np.mean([(view.z_depth < 5.0).mean() for view in seen])
+    assert seen_share(seen, plain[0].bounds) == pytest.approx(share, abs=0.02)
+    assert share < 0.5
+    poses = np.stack([view.world_from_camera for view in seen])
+    found = find_shells(
+        lambda distance: bounds_of_views(seen, poses, distance),
+        1.5,
+        12.0,
+        64,
+        Subject(1.0, 0.0, seen),
+    )
+    assert [shell.voxel for shell in found] == [shell.voxel for shell in plain]
+
+
+def test_shells_that_cut_a_surface_leave_no_gap_and_no_second_one(views: ViewStore) -> None:
+    """The lower half of the ball is in the fine shell, the upper one in the other."""
+    inner = shells_of(views, 1.5)[0]
+    top = np.array([*inner.bounds.box_max[:2], CENTER[2]])
+    lower = Shell(replace(inner.bounds, box_max=top), 0.5 * inner.voxel)
+    mesh = fuse_shells(views, [lower, inner], 200_000)
+    off = mesh.vertices - CENTER
+    lengths = np.linalg.norm(off[mesh.faces] - np.roll(off[mesh.faces], 1, axis=1), axis=-1)
+    half = off[mesh.faces].mean(axis=1)[:, 2] < -0.1
+    assert np.median(lengths[half]) < 0.7 * np.median(lengths[~half])
+    corners = mesh.vertices[mesh.faces]
+    twice_areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(twice_areas, axis=1).sum()
+    assert 0.99 * 4.0 * np.pi < area < 1.1 * 4.0 * np.pi
 
 
 def test_the_ball_is_fine_and_the_walls_are_there(mesh: TriangleMesh) -> None:
