@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, field_validator
 
-from pipelines.errors import ExportError
+from pipelines.errors import ExportError, ToolError
 from pipelines.exports.export import Export
 from pipelines.exports.frame import Axis, Frame
 from pipelines.exports.options import CropOptions, TextureOptions, reach_of
@@ -25,7 +25,7 @@ from pipelines.stage import Artifact, StageContext
 if TYPE_CHECKING:
     from pipelines.exports.formats.glb import GlbStyle
     from pipelines.exports.mesh import TexturedMesh, TriangleMesh
-    from pipelines.exports.surface.shells import Shell
+    from pipelines.exports.surface.shells import Method, Shell
     from pipelines.scene.cameras_file import Intrinsics
     from pipelines.scene.trained_scene import TrainedScene
 
@@ -63,7 +63,7 @@ class MeshOptions(CropOptions, TextureOptions):
         "tsdf",
         description="How depth becomes a surface: tsdf fuses it in a field of voxels; poisson lays "
         "a smooth surface through the points that views agree on, closes small holes, and takes "
-        "longer.",
+        "longer; where its solver fails, tsdf is what is done.",
     )
     resolution: int = Field(
         256,
@@ -187,13 +187,15 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         coarser = _coarser(asked, shells)
         if coarser is not None:
             ctx.logger.warning("The mesh is coarser than asked for: %s", coarser["reason"])
-        mesh = fuse_shells(
-            store,
-            shells,
-            options.max_faces,
-            _part_of(ctx, "fusing depth", _AFFORD_SHARE, _FUSE_SHARE),
-            options.method,
-        )
+        method: Method = options.method
+        told = _part_of(ctx, "fusing depth", _AFFORD_SHARE, _FUSE_SHARE)
+        try:
+            mesh = fuse_shells(store, shells, options.max_faces, told, method)
+        except ToolError as error:
+            # Poisson's solver runs apart; there is a mesh without it, a little rougher.
+            ctx.logger.warning("No Poisson surface, depth is fused in voxels instead: %s", error)
+            method = "tsdf"
+            mesh = fuse_shells(store, shells, options.max_faces, told, method)
     if len(mesh.faces) == 0:
         raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
     shown = scene.training_images()
@@ -208,7 +210,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             photos,
             _part_of(ctx, "refining", _FUSE_SHARE, _REFINE_SHARE),
             flat=options.flatten,
-            noise=max(shell.voxel for shell in shells if not shell.is_far),
+            noise=max((shell.voxel for shell in shells if not shell.is_far), default=0.0),
         )
         del photos
     whole, mesh = mesh, cropped(mesh, crop)
@@ -247,7 +249,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     return {
         "frame": place.as_dict(),
         "formats": list(options.formats),
-        "method": options.method,
+        "method": method,
         "num_vertices": len(mesh.vertices),
         **_told(skin),
         "levels": levels,

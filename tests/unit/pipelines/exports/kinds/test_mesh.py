@@ -13,7 +13,7 @@ from pipelines.errors import Cancelled, ExportError
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh
-from pipelines.exports.surface import tsdf
+from pipelines.exports.surface import poisson_solver, tsdf
 from pipelines.exports.texture import charts
 from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
@@ -53,6 +53,16 @@ def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
     assert len(judged.faces) == manifest["summary"]["num_faces"]
     film = tiny_job.run(job, "meshvideo", num_frames=8)
     assert film["summary"]["num_frames"] == 8
+
+
+def test_there_is_a_mesh_also_where_the_solver_fails(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(poisson_solver, "__file__", "/nowhere/poisson_solver.py")
+    summary = tiny_job.run(job, "mesh", method="poisson", texture="none")["summary"]
+    assert summary["method"] == "tsdf"
+    assert summary["num_faces"] > 500
+    assert "No Poisson surface" in caplog.text
 
 
 def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
