@@ -80,7 +80,12 @@ def texture_from_photos(
     vertices = photos.frame.scene_from_world(mesh.vertices)
     surface = Surface(vertices, mesh.faces, mesh.normals)
     choice = choose_photos(surface, photos, lambda done: on_progress(_CHOICE_SHARE * done))
-    charts = cut(mesh.faces, choice, lambda index, which: photos.pixels(index, vertices[which])[0])
+
+    def places(index: int, which: NDArray[np.int32]) -> Floats:
+        on_progress(_CHOICE_SHARE)
+        return photos.pixels(index, vertices[which])[0]
+
+    charts = cut(mesh.faces, choice, places)
     layout = lay_out(charts, photos.size, largest_side)
     on_progress(_CUT_SHARE)
     # Smaller copies of the texture mix in what lies beside a patch: nothing there is dark.
@@ -92,7 +97,7 @@ def texture_from_photos(
         ground,
         lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
     )
-    added = levels(charts, colors)
+    added = levels(charts, colors, lambda: on_progress(_COPY_SHARE))
     own = mesh.colors[charts.vertex]
     _level(picture, charts, layout, added, lambda: on_progress(_COPY_SHARE))
     _fill_cells(picture, charts, layout, own)
@@ -171,15 +176,18 @@ def _level(
         steps[part][hit] = np.clip(values, -255, 255).astype(np.int16)
         covered[part] = hit
         on_rows()
-    _spread(steps, covered)
+    _spread(steps, covered, on_rows)
     np.clip(picture + steps, 0, 255, out=steps)
     picture[:] = steps.astype(np.uint8)
 
 
-def _spread(values: NDArray[np.int16], covered: NDArray[np.bool_]) -> None:
+def _spread(
+    values: NDArray[np.int16], covered: NDArray[np.bool_], on_pass: Callable[[], None]
+) -> None:
     """Carry values a few pixels beyond what is covered, in place."""
     for _ in range(_SPREAD_PX):
         for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            on_pass()
             into, out = [slice(None)] * 2, [slice(None)] * 2
             into[axis], out[axis] = (
                 (slice(1, None), slice(None, -1)) if step > 0 else (slice(None, -1), slice(1, None))

@@ -8,6 +8,7 @@ Lempitsky and Ivanov, "Seamless mosaicing of image-based texture maps", CVPR 200
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -29,17 +30,20 @@ _OFFSET_ROUNDS, _LEAST_ERROR, _HOLD = 12, 0.01, 1e-3
 _ITERATIONS, _TOLERANCE = 300, 1e-4
 
 
-def levels(charts: Charts, colors: Floats) -> Floats:
+def levels(charts: Charts, colors: Floats, poll: Callable[[], None] = lambda: None) -> Floats:
     """What to add to each corner's colour, [U, 3].
 
-    colors: [U, 3] in [0, 1], as each corner's photo has it; NaN where no photo shows it.
+    colors: [U, 3] in [0, 1], as each corner's photo has it; NaN where no photo shows it. poll:
+    called every fraction of a second; may raise.
     """
     known = charts.photo[charts.chart] != NOBODY
     seams = _seams(charts, known)
     difference = _believed(
         colors[seams[:, 1]] - colors[seams[:, 0]], charts.photo[charts.chart[seams]]
     )
+    poll()
     edges = _edges(charts, known)
+    poll()
     count = len(charts.vertex)
     across, within = _differences(seams, count), _differences(edges, count)
     matrix = csr_array(
@@ -51,7 +55,12 @@ def levels(charts: Charts, colors: Floats) -> Floats:
         wanted = across.T @ difference[:, channel]
         # Jacobi's preconditioner; where it stops early the seams are only less than perfect.
         found[:, channel], _ = cg(
-            matrix, wanted, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=diags_array(scale)
+            matrix,
+            wanted,
+            rtol=_TOLERANCE,
+            maxiter=_ITERATIONS,
+            M=diags_array(scale),
+            callback=lambda _: poll(),
         )
     return found
 

@@ -10,6 +10,7 @@ import pytest
 
 from pipelines.errors import Cancelled
 from pipelines.exports.mesh import TexturedMesh
+from pipelines.exports.texture import bake
 from pipelines.exports.texture.bake import texture_from_photos
 from pipelines.judging.asset_views import MeshCaster, Texture
 from tests.unit.pipelines.exports.texture import painted_ball
@@ -163,3 +164,22 @@ def test_from_afar_a_texture_is_looked_up_in_a_smaller_copy() -> None:
     far = caster.along(eyes, ways, (10, 20), angle=4.0 / 64).color
     assert near.std() > 0.15
     assert np.abs(far - 0.5).max() < 0.01
+
+
+def test_levelling_is_heard_of_and_can_be_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a large mesh it takes longer than all that a person waits for a sign of life."""
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    )
+
+    def on_progress(done: float) -> None:
+        told.append(done)
+        if told.count(bake._COPY_SHARE) > 8:
+            raise Cancelled("enough")
+
+    told: list[float] = []
+    monkeypatch.setattr(bake, "_level", lambda *_: pytest.fail("levelling was not stopped"))
+    with pytest.raises(Cancelled):
+        texture_from_photos(painted_ball.ball(), photos, 1024, on_progress)
