@@ -115,6 +115,7 @@ class WorkerRuntime:
         self._bell = Bell(storage.redis_url, self._database)
         self._direct = ThreadPoolExecutor(identity.slots, thread_name_prefix="direct")
         self._free: queue.SimpleQueue[Runner] = queue.SimpleQueue()
+        self._running: set[str] = set()  # stages; a slot that looks for one takes no cores
         self._gpu = threading.Lock()  # held by the slot whose stage runs on the GPU
         self._stages = load_registry(registry).STAGES
         self._plan = plan = make_plan(storage, settings, os.environ, has_gpu=identity.has_gpu)
@@ -182,9 +183,11 @@ class WorkerRuntime:
         try:
             taken = self._take(stage_id)
             while taken is not None:
+                self._running.add(taken.claim.stage_id)
                 try:
                     ready = runner.run(taken.claim)
                 finally:
+                    self._running.discard(taken.claim.stage_id)
                     if taken.on_gpu:
                         self._gpu.release()
                 taken = self._take()
@@ -298,8 +301,7 @@ class WorkerRuntime:
 
     def _threads_now(self) -> int:
         """A fair share of the processor for a stage that starts now."""
-        busy = self.identity.slots - self._free.qsize()
-        return max(num_cores() // max(busy, 1), 1)
+        return max(num_cores() // max(len(self._running), 1), 1)
 
     def _offer(self) -> None:
         if self._free.empty() or self.shutdown.is_set() or not self._disk.has_room():

@@ -147,10 +147,29 @@ def test_busy_slots_share_the_cores(engine: Engine, monkeypatch: pytest.MonkeyPa
     runtime.start()
     try:
         found = []
-        for _ in range(4):
-            runtime._free.get_nowait()
+        for stage in range(4):
+            runtime._running.add(str(stage))
             found.append(runtime._threads_now())
         assert found == [8, 4, 2, 2]
+    finally:
+        runtime.close()
+
+
+def test_a_slot_that_looks_for_work_takes_no_cores(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a lone job trains on half of them, if the other slot's query happens to be slow."""
+    monkeypatch.setattr("worker.runtime.num_cores", lambda: 8)
+    identity = WorkerIdentity("w", 2, ("cpu",), False)
+    settings = WorkerSettings(prepare=False)
+    runtime = WorkerRuntime(identity, engine.settings, settings, registry=TOYS)
+    runtime.start()
+    looked = []
+    monkeypatch.setattr(runtime, "_take", lambda *_: looked.append(runtime._threads_now()))
+    try:
+        runtime._running.add("the other slot's")
+        runtime.serve()
+        assert looked == [8]
     finally:
         runtime.close()
 
