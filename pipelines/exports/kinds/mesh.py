@@ -192,6 +192,8 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         try:
             mesh = fuse_shells(store, shells, options.max_faces, told, method)
         except ToolError as error:
+            if method != "poisson":
+                raise
             # Poisson's solver runs apart; there is a mesh without it, a little rougher.
             ctx.logger.warning("No Poisson surface, depth is fused in voxels instead: %s", error)
             method = "tsdf"
