@@ -180,18 +180,9 @@ def read_matches(
 
     Call it only while pycolmap has the database closed.
     """
-    places: list[npt.NDArray[np.float64]] = [np.zeros((0, 2)) for _ in range(num_images)]
     found = {}
     with contextlib.closing(sqlite3.connect(database)) as connection:
-        index_of = {
-            image_id: image_index(name)
-            for image_id, name in connection.execute("SELECT image_id, name FROM images")
-        }
-        for image_id, rows, columns, blob in connection.execute(
-            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
-        ):
-            values = np.frombuffer(blob, np.float32).reshape(rows, columns)
-            places[index_of[image_id]] = values[:, :2].astype(np.float64)
+        index_of, places = _features(connection, num_images)
         (count,) = connection.execute(
             "SELECT COUNT(*) FROM two_view_geometries WHERE rows > 0"
         ).fetchone()
@@ -205,6 +196,23 @@ def read_matches(
             matches = np.frombuffer(blob, np.uint32).reshape(rows, 2)[_evenly(rows, most_matches)]
             found[i, j] = places[i][matches[:, 0]], places[j][matches[:, 1]]
     return found
+
+
+def _features(
+    connection: sqlite3.Connection, num_images: int
+) -> tuple[dict[int, int], list[npt.NDArray[np.float64]]]:
+    """The index of each image by its id, and by index where its features are, [F, 2] pixels."""
+    places: list[npt.NDArray[np.float64]] = [np.zeros((0, 2)) for _ in range(num_images)]
+    index_of = {
+        image_id: image_index(name)
+        for image_id, name in connection.execute("SELECT image_id, name FROM images")
+    }
+    for image_id, rows, columns, blob in connection.execute(
+        "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
+    ):
+        values = np.frombuffer(blob, np.float32).reshape(rows, columns)
+        places[index_of[image_id]] = values[:, :2].astype(np.float64)
+    return index_of, places
 
 
 @dataclass(frozen=True)
@@ -221,18 +229,9 @@ class Correspondences:
 
 def read_correspondences(database: Path, num_images: int) -> Correspondences:
     """All verified matches. Call it only while pycolmap has the database closed."""
-    places: list[npt.NDArray[np.float64]] = [np.zeros((0, 2)) for _ in range(num_images)]
     found = {}
     with contextlib.closing(sqlite3.connect(database)) as connection:
-        index_of = {
-            image_id: image_index(name)
-            for image_id, name in connection.execute("SELECT image_id, name FROM images")
-        }
-        for image_id, rows, columns, blob in connection.execute(
-            "SELECT image_id, rows, cols, data FROM keypoints WHERE rows > 0"
-        ):
-            values = np.frombuffer(blob, np.float32).reshape(rows, columns)
-            places[index_of[image_id]] = values[:, :2].astype(np.float64)
+        index_of, places = _features(connection, num_images)
         for pair_id, rows, blob in connection.execute(
             "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0"
         ):
