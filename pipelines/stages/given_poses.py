@@ -72,12 +72,10 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             posed,
             reconstructor,
             _settings(options, ctx),
-            lambda share, message: ctx.progress(share, message),
+            ctx.progress,
             measured,
             upsample=options.upsample,
-            num_threads=max(options.num_threads, 1)
-            if options.num_threads > 0
-            else num_processors(),
+            num_threads=options.num_threads if options.num_threads > 0 else num_processors(),
             seed=ctx.seed,
         )
         judged = judge.judge(options.given, lambda poses: as_sent(poses, cameras.notes))
