@@ -13,12 +13,12 @@ from api.deps import ServicesDep
 from api.errors import responses
 from api.jobs.service import default_preset
 from pipelines.options import (
-    PRESETS,
     STAGE_OPTIONS,
     method_names,
     resolve_options,
     train_options,
 )
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES
 
 router = APIRouter(prefix="/v1", tags=["catalogue"])

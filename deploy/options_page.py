@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipelines.options import PRESETS, STAGE_OPTIONS, method_names, train_options
+from pipelines.options import STAGE_OPTIONS, method_names, train_options
+from pipelines.presets import PRESETS
 
 TABLE_HEAD = ("| option | default | allowed | meaning |", "|---|---|---|---|")
 _NULL = {"type": "null"}

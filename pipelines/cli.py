@@ -29,7 +29,8 @@ from pipelines.manifest import (
     run_job_locally,
     run_stage,
 )
-from pipelines.options import PRESETS, OptionsError, resolve_options
+from pipelines.options import OptionsError, resolve_options
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, get_stage
 from pipelines.stage import Stage
 from pipelines.stages.report import write_failed_report_locally

@@ -33,6 +33,7 @@ API_MAY_IMPORT = (
     "api",
     "storage",
     "pipelines.options",
+    "pipelines.presets",
     "pipelines.registry",
     "pipelines.stage",
     "pipelines.manifest",
@@ -51,7 +52,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "storage": ("storage",),
     "worker": ("worker", "pipelines", "storage"),
     "pipelines": ("pipelines",),
-    "deploy": ("deploy", "storage", "api.client", "pipelines.options", "pipelines.assignments"),
+    "deploy": (
+        "deploy",
+        "storage",
+        "api.client",
+        "pipelines.options",
+        "pipelines.presets",
+        "pipelines.assignments",
+    ),
 }
 # What lies in pipelines/ beside its rooms, lowest first, and what of a room it may name.
 FRAME = (
@@ -61,6 +69,7 @@ FRAME = (
     "stage",
     "option_models",
     "registry",
+    "presets",
     "options",
     "manifest",
     "cli",
@@ -74,6 +83,7 @@ FRAME_MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "pipelines.exports.catalogue",
         "pipelines.exports.export",
     ),
+    "presets": ("pipelines.exports.catalogue",),
     "options": (
         "pipelines.captures.minimum",
         "pipelines.exports.catalogue",

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from api.app import create_app
-from pipelines.options import PRESETS, STAGE_OPTIONS
+from pipelines.options import STAGE_OPTIONS
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGES
 
 ROOT = Path(__file__).resolve().parent.parent

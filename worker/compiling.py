@@ -15,7 +15,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pipelines.options import PRESETS, resolve_options, stage_options, train_config
+from pipelines.options import resolve_options, stage_options, train_config
+from pipelines.presets import PRESETS
 from worker.containment.plan import Plan
 
 _PARTS = ("stereo", "training", "rendering")

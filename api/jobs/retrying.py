@@ -12,7 +12,8 @@ from api.jobs.schemas import RetryRequest
 from api.problems import ConflictedError, FieldProblem, InvalidRequestError, MissingError
 from pipelines.exports.requests import resolve_export
 from pipelines.manifest import fingerprint
-from pipelines.options import PRESETS, OptionsError, revise_options
+from pipelines.options import OptionsError, revise_options
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, get_stage
 from storage import jobs
 from storage.exports import live_exports

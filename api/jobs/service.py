@@ -14,7 +14,8 @@ from api.idempotency import Once, do_once
 from api.jobs import retrying
 from api.jobs.schemas import JobPlan, JobRequest, JobView, JobWish, RetryRequest
 from api.problems import ConflictedError, FieldProblem, InvalidRequestError
-from pipelines.options import PRESETS, resolve_options, stages_skipped
+from pipelines.options import resolve_options, stages_skipped
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, STAGES
 from storage import jobs, queries, records
 from storage.jobs import StageSeed

@@ -1,7 +1,7 @@
 """Native code that holds the interpreter, run as a script in a process of its own.
 
-Whoever waits for such code could neither tell that it goes on nor be cancelled. A script reads
-arrays from `given.npz` of a folder and writes `made.npz` there.
+Whoever waits for such code could neither tell that it goes on nor be cancelled. A script gets the
+paths of two .npz files: of the arrays that it reads, and of those that it writes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from pipelines.tools.process import Program
 
-GIVEN, MADE = "given.npz", "made.npz"
 _TELL_S = 1.0
 
 
@@ -43,10 +42,11 @@ def run_apart(
         return False
 
     with tempfile.TemporaryDirectory(prefix="apart-") as name:
-        folder = Path(name)
-        np.savez(folder / GIVEN, **given)
+        read, written = Path(name, "given.npz"), Path(name, "made.npz")
+        np.savez(read, **given)
         # -P: the modules beside the script are no modules of the programs that it uses.
-        with Program([sys.executable, "-P", script, name], is_cancelled=wait) as program:
+        command = [sys.executable, "-P", script, str(read), str(written)]
+        with Program(command, is_cancelled=wait) as program:
             program.wait()
-        with np.load(folder / MADE) as made:
+        with np.load(written) as made:
             return {key: made[key] for key in made.files}

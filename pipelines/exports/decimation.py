@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
-INPUT, OUTPUT = "given.npz", "made.npz"
 _OVERSHOOT = 1.02
 
 
@@ -40,13 +39,13 @@ def decimated(vertices: Floats, faces: Faces, triangles: int) -> tuple[Floats, F
     return np.asarray(fewer, np.float64), np.asarray(corners, np.int32).reshape(-1, 3)
 
 
-def main(folder: Path) -> None:
-    """Read the piece that lies in a folder, and write there what is left of it."""
-    with np.load(folder / INPUT) as piece:
+def main(read: Path, written: Path) -> None:
+    """Read a piece, and write what is left of it."""
+    with np.load(read) as piece:
         vertices, faces, triangles = piece["vertices"], piece["faces"], int(piece["triangles"])
     vertices, faces = decimated(vertices, faces, triangles)
-    np.savez(folder / OUTPUT, vertices=vertices, faces=faces)
+    np.savez(written, vertices=vertices, faces=faces)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -12,7 +12,8 @@ from pydantic import ValidationError
 
 from pipelines.exports.catalogue import get_export
 from pipelines.option_models import StageOptions
-from pipelines.options import PRESETS, OptionsError, merge
+from pipelines.options import OptionsError, merge
+from pipelines.presets import PRESETS
 
 _SWITCH = "enabled"
 """The option of kinds that jobs may be told to leave out."""

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pipelines.captures.sniff import sniff
 from pipelines.manifest import run_job_locally
-from pipelines.options import PRESETS
+from pipelines.presets import PRESETS
 from pipelines.sample.align import path_extent, similarity
 from pipelines.sample.film import film_capture
 from pipelines.scene.cameras_file import CamerasFile

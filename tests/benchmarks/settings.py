@@ -31,7 +31,7 @@ def preset_config(name: str) -> TrainConfig:
     if name in ("standard", "paper"):
         return TrainConfig()
     try:
-        from pipelines.options import PRESETS
+        from pipelines.presets import PRESETS
     except ModuleNotFoundError as error:
         raise NerfError(
             "bad_config",

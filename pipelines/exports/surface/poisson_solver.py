@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 import open3d
 
-INPUT, OUTPUT = "given.npz", "made.npz"
 _SCALE = 1.1
 
 
-def main(folder: Path) -> None:
+def main(read: Path, written: Path) -> None:
     """Read points [P, 3], normals [P, 3], colors [P, 3] and the width of the finest cells; write
     the surface."""
     geometry: Any = open3d.geometry
     vector: Any = open3d.utility.Vector3dVector
-    with np.load(folder / INPUT) as given:
+    with np.load(read) as given:
         cloud = geometry.PointCloud(vector(given["points"]))
         cloud.normals = vector(given["normals"])
         cloud.colors = vector(given["colors"])
@@ -31,7 +30,7 @@ def main(folder: Path) -> None:
         cloud, width=width, scale=_SCALE, n_threads=1
     )
     np.savez(
-        folder / OUTPUT,
+        written,
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.triangles, np.int32),
         colors=np.clip(np.asarray(mesh.vertex_colors), 0.0, 1.0),
@@ -39,4 +38,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

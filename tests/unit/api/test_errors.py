@@ -17,7 +17,8 @@ from api.codes import CODES
 from api.errors import to_api_error
 from api.problems import ApiError
 from pipelines import errors as pipeline_errors
-from pipelines.options import PRESETS, STAGE_OPTIONS, resolve_options
+from pipelines.options import STAGE_OPTIONS, resolve_options
+from pipelines.presets import PRESETS
 from storage import errors as storage_errors
 from storage.api_keys import create_api_key, revoke_api_key
 from tests.services import RedisServer

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from pipelines.options import ON_REQUEST, PRESETS, resolve_options
+from pipelines.options import ON_REQUEST, resolve_options
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, STAGES
 from storage.claims import Claim, claim_stage
 from storage.jobs import stage_id

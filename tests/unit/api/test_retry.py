@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from pipelines.options import PRESETS, OptionsError, resolve_options, revise_options
+from pipelines.options import OptionsError, resolve_options, revise_options
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGES
 from storage.claims import claim_stage
 from storage.jobs import stage_id

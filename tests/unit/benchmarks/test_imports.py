@@ -10,7 +10,7 @@ from tests.test_architecture import NERF_MAY_IMPORT, imports_of, within
 FOLDER = Path(benchmarks.__file__).parent
 
 # Presets are pydantic's: asked for only where a preset is, with an error that says so.
-ONLY_FOR_PRESETS = ("settings.py", "pipelines.options.PRESETS")
+ONLY_FOR_PRESETS = ("settings.py", "pipelines.presets.PRESETS")
 
 # They measure the product around the NeRF, so they need all that it needs.
 OF_THE_WHOLE_PRODUCT = (

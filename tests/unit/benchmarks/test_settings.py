@@ -11,7 +11,7 @@ from pipelines.nerf.errors import NerfError
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, ProposalConfig
 from pipelines.nerf.options.parts import HashGridConfig
 from pipelines.nerf.options.train import TrainConfig
-from pipelines.options import PRESETS
+from pipelines.presets import PRESETS
 from tests.benchmarks.settings import overridden, preset_config, sampling_model
 
 

@@ -23,7 +23,8 @@ from pipelines.manifest import (
     run_job_locally,
     run_stage,
 )
-from pipelines.options import ON_REQUEST, PRESETS, stages_skipped
+from pipelines.options import ON_REQUEST, stages_skipped
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, STAGES, get_stage
 from pipelines.stage import Stage, StageContext
 from pipelines.workspace import Workspace

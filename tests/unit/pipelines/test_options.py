@@ -8,12 +8,12 @@ import pytest
 
 from pipelines.options import (
     ON_REQUEST,
-    PRESETS,
     STAGE_OPTIONS,
     OptionsError,
     resolve_options,
     stages_skipped,
 )
+from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, STAGES, skipped_stages
 
 NEEDED_WHERE_THERE = {"report"}

@@ -27,7 +27,7 @@ from api.client.display import (
     size,
     watch_job,
 )
-from pipelines.options import PRESETS
+from pipelines.presets import PRESETS
 from storage.claims import claim_stage
 from storage.jobs import stage_id
 from storage.leases import fail_stage, heartbeat

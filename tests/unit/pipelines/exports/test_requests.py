@@ -8,7 +8,8 @@ import pytest
 
 from pipelines.exports.catalogue import KINDS
 from pipelines.exports.requests import resolve_export
-from pipelines.options import PRESETS, OptionsError, resolve_options
+from pipelines.options import OptionsError, resolve_options
+from pipelines.presets import PRESETS
 
 FLIGHT: dict[str, Any] = {
     "render_height": 64,
