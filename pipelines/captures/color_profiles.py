@@ -3,6 +3,9 @@
 Phones take photos in Display P3, cameras in Adobe RGB, scanners and print shops in their own. Read
 as sRGB such numbers are other colours. The conversion is colorimetric, with black mapped to black;
 what sRGB cannot show is clipped.
+
+HEIC may name its colours by numbers instead (`nclx`, ITU-T H.273): primaries, and a transfer
+function, which may be HDR's: those become SDR as HDR video does (`pipelines.captures.hdr`).
 """
 
 from __future__ import annotations
@@ -11,14 +14,20 @@ import functools
 import io
 
 import numpy as np
+import numpy.typing as npt
 import PIL.Image
-from PIL import ImageCms
+from PIL import ImageCms, ImageFilter
 
+from pipelines.captures.hdr import BT709_FROM_BT2020, SDR_GAMMA, hlg_from_pq
 from pipelines.errors import CaptureError
 
 _MODE_OF_SPACE = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
 _FITTING_MODES = {"RGB": ("RGB", "L"), "GRAY": ("L",), "CMYK": ("CMYK",)}
 """Modes that a profile of each colour space can speak of; a grey RGB picture may be stored as L."""
+_PRIMARIES_BT2020, _PRIMARIES_P3 = 9, 12
+_TRANSFER_PQ, _TRANSFER_HLG = 16, 18
+_SRGB_FROM_P3 = ((1.22494, -0.22494, 0.0), (-0.04206, 1.04206, 0.0), (-0.01964, -0.07864, 1.09828))
+_TABLE_SIDE = 33
 _SAME_LEVELS = 2
 """A profile that moves no colour by more is sRGB under one of its many names."""
 _GRID = np.stack(
@@ -34,7 +43,10 @@ def in_srgb(image: PIL.Image.Image) -> PIL.Image.Image:
     """
     profile = image.info.get("icc_profile")
     if not profile:
-        return image
+        named = image.info.get("nclx_profile") or {}
+        return _from_numbers(
+            image, named.get("color_primaries"), named.get("transfer_characteristics")
+        )
     colors, alpha = _split(image)
     try:
         transform = _transform(bytes(profile), colors.mode)
@@ -48,6 +60,44 @@ def in_srgb(image: PIL.Image.Image) -> PIL.Image.Image:
     if alpha is not None:
         converted.putalpha(alpha)
     return converted
+
+
+def _from_numbers(
+    image: PIL.Image.Image, primaries: int | None, transfer: int | None
+) -> PIL.Image.Image:
+    """The picture in sRGB, by H.273's numbers of its colours; itself where those are near sRGB's.
+
+    Other transfer functions of SDR are taken for sRGB's, as viewers do.
+    """
+    if primaries not in (_PRIMARIES_BT2020, _PRIMARIES_P3):
+        return image
+    colors, alpha = _split(image)
+    converted = colors.convert("RGB").filter(_table(primaries, transfer or 0))
+    if alpha is not None:
+        converted.putalpha(alpha)
+    return converted
+
+
+@functools.lru_cache(maxsize=8)
+def _table(primaries: int, transfer: int) -> ImageFilter.Color3DLUT:
+    steps = np.linspace(0.0, 1.0, _TABLE_SIDE)
+    blue, green, red = np.meshgrid(steps, steps, steps, indexing="ij")
+    signal = np.stack([red, green, blue], axis=-1).reshape(-1, 3)
+    matrix = np.array(BT709_FROM_BT2020 if primaries == _PRIMARIES_BT2020 else _SRGB_FROM_P3)
+    if transfer in (_TRANSFER_PQ, _TRANSFER_HLG):
+        signal = hlg_from_pq(signal) if transfer == _TRANSFER_PQ else signal
+        shown = np.clip(signal**SDR_GAMMA @ matrix.T, 0.0, 1.0) ** (1 / SDR_GAMMA)
+    else:
+        shown = _srgb_signal(np.clip(_srgb_light(signal) @ matrix.T, 0.0, 1.0))
+    return ImageFilter.Color3DLUT(_TABLE_SIDE, shown.ravel().tolist())
+
+
+def _srgb_light(signal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+
+
+def _srgb_signal(light: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def _split(image: PIL.Image.Image) -> tuple[PIL.Image.Image, PIL.Image.Image | None]:

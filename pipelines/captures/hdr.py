@@ -30,8 +30,8 @@ _SYSTEM_GAMMA = 1.2
 _LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
 _M1, _M2 = 2610 / 16384, 2523 / 4096 * 128
 _C1, _C2, _C3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
-_SDR_GAMMA = 2.4
-_BT709_FROM_BT2020 = (
+SDR_GAMMA = 2.4
+BT709_FROM_BT2020 = (
     (1.6605, -0.5876, -0.0728),
     (-0.1246, 1.1329, -0.0083),
     (-0.0182, -0.1006, 1.1187),
@@ -81,8 +81,8 @@ def sdr_filters(kind: str, pq_table: Path | None) -> list[str]:
     if kind == "pq":
         assert pq_table is not None, "PQ needs its table"
         filters.append(f"lut3d=file={_escaped(pq_table)}:interp=tetrahedral")
-    matrix = ":0:".join(":".join(f"{value}" for value in row) for row in _BT709_FROM_BT2020)
-    filters += [_power(_SDR_GAMMA), f"colorchannelmixer={matrix}", _power(1 / _SDR_GAMMA)]
+    matrix = ":0:".join(":".join(f"{value}" for value in row) for row in BT709_FROM_BT2020)
+    filters += [_power(SDR_GAMMA), f"colorchannelmixer={matrix}", _power(1 / SDR_GAMMA)]
     return filters
 
 

@@ -117,7 +117,7 @@ def _known(name: str, head: bytes) -> tuple[str, str]:
     if image_format(head):
         return "picture", ""
     if foreign:
-        return f"{foreign} picture", f"{foreign} is not read, convert it to JPEG"
+        return f"{foreign} picture", f"{foreign} is not read, convert it to PNG or JPEG"
     if video_container(head):
         return "video", "videos are read where they are sent without photos or poses"
     program = _program(name, suffix, head)

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.named_files import NamedFiles, folder_of
 from pipelines.captures.parsing import missing, some_of
+from pipelines.captures.roles import PICTURE_SUFFIX
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 
-_SUFFIX = re.compile(r"\.(jpe?g|png|webp|tiff?|heic|heif|dng|cr[23]|nef|arw|raf|rw2|orf)$", re.I)
+_SUFFIX = re.compile(rf"{PICTURE_SUFFIX}$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,16 @@
 """Which pictures of an archive are photos: what else lies beside them is set aside, with a reason.
 
-Four things tell, in this order:
+Five things tell, in this order:
 
-1. channels: beside colour photos, a lossless picture of one channel is a mask, a depth or a
+1. takes: a photo that lies there as camera raw and developed, or as HEIC and JPEG, is taken once.
+2. channels: beside colour photos, a lossless picture of one channel is a mask, a depth or a
    confidence map. Where no picture has colour, grey ones are photos unless their name says what
    else they are.
-2. values: pictures of a few flat colours are masks or label maps. Only those that are packed far
+3. values: pictures of a few flat colours are masks or label maps. Only those that are packed far
    smaller than photos are decoded for it.
-3. names: folders and files called mask, depth, conf, thumbnail and the like (`roles`), which speak
+4. names: folders and files called mask, depth, conf, thumbnail and the like (`roles`), which speak
    only where photos remain beside them.
-4. copies: the same picture again, in the same size or reduced (`images_2/`, `images_4/`); decided
+5. copies: the same picture again, in the same size or reduced (`images_2/`, `images_4/`); decided
    by comparing what they show, not by the folder.
 
 What cannot be decoded stays, for whoever writes the pictures to report.
@@ -18,15 +19,17 @@ What cannot be decoded stays, for whoever writes the pictures to report.
 from __future__ import annotations
 
 import io
-import struct
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import PIL.Image
+import PIL.ImageOps
 
+from pipelines.captures.decoders import DAMAGED, open_picture
+from pipelines.captures.exif import read_exif
+from pipelines.captures.raw_photos import FORMAT as RAW
 from pipelines.captures.roles import file_role, folder_role, named_role, plain_stem
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -34,22 +37,20 @@ from pipelines.stage import StageContext
 
 _HEADER_BYTES = 256 << 10
 _MOST_BYTES = 256 << 20
-_UNREADABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    OverflowError,
-    struct.error,
-    PIL.Image.DecompressionBombError,
-)
-"""What Pillow raises for a damaged picture."""
-
+_HEADED = frozenset({"JPEG", "PNG", "WEBP"})
+"""Formats whose first bytes say what a picture is; of others the directory may lie at the end."""
+_OF_CAMERAS = frozenset({"JPEG", "HEIF", "AVIF", RAW})
+"""Formats that cameras write photos in, and nobody writes numbers in that must not change."""
 _FEW_COLORS = 32
-_FLAT_BYTES_PER_PIXEL = {"JPEG": 0.1, "PNG": 0.25, "WEBP": 0.1}
+_FLAT_BYTES_PER_PIXEL = {
+    "JPEG": 0.1,
+    "PNG": 0.25,
+    "WEBP": 0.1,
+    "HEIF": 0.05,
+    "AVIF": 0.05,
+    "TIFF": 0.25,
+    RAW: 0.0,
+}
 """Pictures of few flat colours are packed smaller; photos are only where they are very empty."""
 _HEADER_ALLOWANCE_BYTES = 2048
 _FLAT_LOOK_PX = 256
@@ -64,11 +65,16 @@ _COPY_DIFFERENCE = 3.0
 """Mean difference in brightness, of 255, of reduced pictures that show the same. On real photos a
 copy at an eighth of the size comes to 0.7 to 2.8, by its filter; a view a hundredth of the picture
 aside to 6 and more."""
+_FIRST_ON_ITS_SIDE = 5
+"""EXIF orientations from here on exchange width and height."""
+_SAME_TAKE = 0.9
+"""Correlation in brightness, reduced, of a raw and the photo developed from it, which may be
+brighter and have other contrast."""
 
 
 @dataclass(frozen=True)
 class _Look:
-    """What a picture's header says."""
+    """What a picture's header says. width, height: of the picture turned upright."""
 
     name: str
     kind: str
@@ -108,6 +114,7 @@ def choose_photos(
             looks.append(look)
         ctx.progress(0.0, f"Looking at picture {done} of {len(names)}")
     images = _Images(archive, max_pixels)
+    looks = _once_each(archive, looks)
     looks = _by_channels(archive, looks)
     looks = _by_values(archive, looks, images)
     looks = _by_names(archive, looks)
@@ -124,12 +131,14 @@ def choose_photos(
 def _look(archive: CaptureArchive, name: str) -> _Look | None:
     kind = archive.image_format(name)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            data = io.BytesIO(archive.peek(name, _HEADER_BYTES))
-            with PIL.Image.open(data, formats=[kind]) as image:
-                return _Look(name, kind, image.mode, image.width, image.height)
-    except _UNREADABLE:
+        data = io.BytesIO(archive.peek(name, _HEADER_BYTES if kind in _HEADED else _MOST_BYTES))
+        with open_picture(data, kind) as image:
+            found = RAW if image.format == RAW else kind
+            sides = image.size
+            if (read_exif(image).orientation or 1) >= _FIRST_ON_ITS_SIDE:
+                sides = sides[1], sides[0]
+            return _Look(name, found, image.mode, *sides)
+    except DAMAGED:
         return None
 
 
@@ -141,27 +150,47 @@ class _Images:
         self._max_pixels = max_pixels
 
     def decoded(self, look: _Look, near_px: int) -> PIL.Image.Image | None:
-        """The picture in RGB, or None where it does not decode or has too many pixels.
+        """The picture upright in RGB, or None where it does not decode or has too many pixels.
 
-        near_px: a JPEG is decoded at the smallest size that is no smaller.
+        near_px: a JPEG is decoded at the smallest size that is no smaller, a raw at half of its.
         """
         if look.num_pixels > self._max_pixels:
             return None
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                data = io.BytesIO(self._archive.peek(look.name, _MOST_BYTES))
-                with PIL.Image.open(data, formats=[look.kind]) as image:
-                    image.draft("RGB", (near_px, near_px))
-                    return image.convert("RGB")
-        except _UNREADABLE:
+            data = io.BytesIO(self._archive.peek(look.name, _MOST_BYTES))
+            with open_picture(data, look.kind) as image:
+                image.draft("RGB", (near_px, near_px))
+                return PIL.ImageOps.exif_transpose(image).convert("RGB")
+        except DAMAGED:
             return None
+
+
+def _once_each(archive: CaptureArchive, looks: Sequence[_Look]) -> list[_Look]:
+    """The pictures without those that are the same take as another one of that name and folder.
+
+    Phones and cameras write a raw and the photo that they developed from it, and apps an HEIC and
+    a JPEG. Developed ones are preferred to raw, then larger ones, then HEIC to what was made of it.
+    """
+    takes: dict[str, list[_Look]] = defaultdict(list)
+    for look in looks:
+        if look.kind in _OF_CAMERAS:
+            takes[look.name.rpartition(".")[0].lower()].append(look)
+    raw: list[str] = []
+    others: list[str] = []
+    for take in takes.values():
+        best = min(take, key=lambda look: (look.kind == RAW, -look.num_pixels, look.kind == "JPEG"))
+        for look in take:
+            if look.kind != best.kind:
+                (raw if look.kind == RAW else others).append(look.name)
+    archive.set_aside(raw, "the same photo lies there developed")
+    archive.set_aside(others, "the same photo lies there in another format")
+    return _without(looks, [*raw, *others])
 
 
 def _by_channels(archive: CaptureArchive, looks: Sequence[_Look]) -> list[_Look]:
     if any(look.has_color for look in looks):
         # Cameras write grey photos too, as JPEG; maps, whose values count, are never lossy.
-        out = [look for look in looks if not look.has_color and look.kind != "JPEG"]
+        out = [look for look in looks if not look.has_color and look.kind not in _OF_CAMERAS]
     else:
         out = [look for look in looks if named_role(look.name) is not None]
     deep = [look.name for look in out if look.is_deep]
@@ -252,12 +281,15 @@ def _without_copies(
 
 
 def _groups(looks: Iterable[_Look], key: Callable[[_Look], object]) -> list[list[_Look]]:
-    """Pictures of equal key, groups of one left out, the largest first in each."""
+    """Pictures of equal key, groups of one left out, the largest first in each, raw last."""
     found: dict[object, list[_Look]] = defaultdict(list)
     for look in looks:
         found[key(look)].append(look)
     return [
-        sorted(group, key=lambda look: (-look.num_pixels, look.name.count("/"), look.name))
+        sorted(
+            group,
+            key=lambda look: (look.kind == RAW, -look.num_pixels, look.name.count("/"), look.name),
+        )
         for group in found.values()
         if len(group) > 1
     ]
@@ -288,8 +320,13 @@ def _shows_same(
         np.asarray(item.convert("L").resize((side, side), PIL.Image.Resampling.BOX), np.float32)
         for item in (image, original)
     ]
-    difference = float(np.abs(reduced[0] - reduced[1]).mean())
-    return abs(aspect - 1) <= _ASPECT_SLACK and difference <= _COPY_DIFFERENCE
+    if abs(aspect - 1) > _ASPECT_SLACK:
+        return False
+    if (look.kind == RAW) != (other.kind == RAW):
+        first, second = (values - values.mean() for values in reduced)
+        spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
+        return spread > 0 and float((first * second).sum()) >= _SAME_TAKE * spread
+    return float(np.abs(reduced[0] - reduced[1]).mean()) <= _COPY_DIFFERENCE
 
 
 def _without(looks: Iterable[_Look], names: Iterable[str]) -> list[_Look]:

@@ -8,23 +8,21 @@ with poses are not, since their intrinsics speak of the pixels as stored.
 from __future__ import annotations
 
 import shutil
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import PIL.Image
-import PIL.ImageFile
 import PIL.ImageOps
 
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.color_profiles import in_srgb
+from pipelines.captures.decoders import DAMAGED, open_picture
 from pipelines.captures.exif import Exif, read_exif
 from pipelines.captures.panorama_files import photo_projection
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 
-FORMATS = ("JPEG", "PNG", "WEBP")
 JPEG_QUALITY = 95
 # Segments of a JPEG that hold nothing private: JFIF and Adobe's note on the colour transform.
 _HARMLESS_SEGMENTS = frozenset({"APP0", "APP14"})
@@ -168,21 +166,18 @@ class PictureWriter:
 
 
 def opened(path: Path, name: str, kind: str, max_pixels: int) -> PIL.Image.Image:
-    """An extracted picture, fully decoded. name: in the archive. kind: Pillow's name of its format.
+    """An extracted picture, fully decoded. name: in the archive. kind: `magic.image_format`'s.
 
     Raises CaptureError image_undecodable, also for more than `max_pixels`.
     """
     try:
-        with warnings.catch_warnings():
-            # Pillow only warns between its limit and twice that; our own limit is an error.
-            warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
-            image = PIL.Image.open(path, formats=[kind])
+        image = open_picture(path, kind)
         if image.width * image.height > max_pixels:
             raise _undecodable(
                 name, f"has {image.width}x{image.height} pixels; {max_pixels} are allowed"
             )
         image.load()
-    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+    except DAMAGED as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise  # the disk's fault, not the picture's
         raise _undecodable(name, "does not decode") from error

@@ -8,6 +8,12 @@ from __future__ import annotations
 
 import re
 
+PICTURE_SUFFIX = (
+    r"\.(jpe?g|png|webp|tiff?|hei[cf]s?|hif|avif|"
+    r"dng|cr[23w]|nef|nrw|arw|srf|sr2|raf|rw2|orf|pef|srw)"
+)
+"""How names of pictures end, as a pattern."""
+
 _WHATS = {
     "mask": "masks",
     "masks": "masks",
@@ -53,7 +59,7 @@ def plain_stem(name: str) -> str:
 def _stem(name: str) -> str:
     """The name without folders and suffixes; "a.jpg.png", as COLMAP calls masks, is "a"."""
     base = name.rpartition("/")[2]
-    return re.sub(r"(\.(jpe?g|png|webp))+$", "", base, flags=re.IGNORECASE)
+    return re.sub(rf"({PICTURE_SUFFIX})+$", "", base, flags=re.IGNORECASE)
 
 
 def _role(text: str) -> str | None:

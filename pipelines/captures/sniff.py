@@ -32,8 +32,8 @@ from pipelines.captures.magic import (
 from pipelines.errors import CaptureError
 
 _ACCEPTED = (
-    "Send a video (MP4, MOV, MKV, WebM, AVI), a .zip of photos or of several videos, or a .zip of "
-    "an app export."
+    "Send a video (MP4, MOV, MKV, WebM, AVI), a .zip of photos (JPEG, HEIC, raw) or of several "
+    "videos, or a .zip of an app export."
 )
 
 
@@ -77,7 +77,7 @@ def _unknown(head: bytes, filename: str) -> CaptureError:
         return CaptureError(
             f"The file is a single picture ({image}); one picture has no depth.",
             code="unknown_type",
-            hint="Send a video, or a .zip of many photos (JPEG, PNG or WebP) of the subject.",
+            hint="Send a video, or a .zip of many photos of the subject.",
         )
     if head.startswith((b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b")) or head[:3] == b"BZh":
         return CaptureError(
@@ -128,7 +128,7 @@ def _sniff_zip(path: Path, limits: ArchiveLimits) -> Sniffed:
 
 def _no_images(heads: Mapping[str, bytes]) -> CaptureError:
     foreign = sorted({kind for head in heads.values() if (kind := foreign_image(head))})
-    hint = "Put the photos (JPEG, PNG or WebP) into the .zip."
+    hint = "Put the photos (JPEG, HEIC, camera raw, PNG, WebP, AVIF, TIFF) into the .zip."
     if foreign:
         hint = f"{', '.join(foreign)} pictures are not supported yet: convert them to JPEG."
     return CaptureError(

@@ -16,11 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipelines.workspace import Workspace
 from storage.settings import StorageSettings
 from tests.integration.engine import is_running
+from tests.photo_writers import dng, heic
 from worker.containment import landlock
 from worker.containment.apply import ContainmentError, apply_plan
 from worker.containment.environment import stage_environment
@@ -196,6 +198,9 @@ def test_a_stage_cannot_signal_its_worker_or_its_guardian(nosy: Nosy) -> None:
 
 @linux
 def test_what_stages_do_goes_on_working(nosy: Nosy) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+    (nosy.workspace.root / "photo.heic").write_bytes(heic(pixels))
+    (nosy.workspace.root / "photo.dng").write_bytes(dng(pixels))
     message = nosy.run(["work"])
     assert message["type"] == "done", "\n".join(nosy.lines)
     assert "checkpoint" in [told["type"] for told in nosy.messages]

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import random
+import resource
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipelines.captures.sniff import sniff
@@ -20,6 +22,7 @@ from pipelines.errors import CaptureError, PipelineError, ToolError
 from pipelines.options import IngestOptions
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.stages.ingest import run
+from tests.photo_writers import Dng, Heic, dng, heic
 from tests.sfm_writers import (
     colmap_files,
     metashape_xml,
@@ -34,6 +37,7 @@ from tests.unit.pipelines.captures.archives import (
     context,
     llff_files,
     nerfstudio_files,
+    phone_exif,
     picture,
     polycam_files,
     record3d_files,
@@ -42,6 +46,7 @@ from tests.unit.pipelines.captures.archives import (
     stray_files,
     write_zip,
 )
+from tests.unit.pipelines.captures.icc import DISPLAY_P3_XYZ, rgb_profile
 from tests.unit.pipelines.captures.importers.test_blender import blender_files
 from tests.unit.pipelines.captures.ingesting import Files
 from tests.unit.pipelines.tools.clips import make_clip
@@ -222,11 +227,20 @@ def test_damaged_lists_of_photogrammetry_programs(tmp_path: Path, kind: str) -> 
         assert outcome(tmp_path / str(n), zipped(tmp_path, files | {name: changed}, 0))
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def photo(seed: int, kind: str) -> bytes:
+    if kind not in ("HEIC", "DNG"):
+        return picture(seed=seed, kind=kind)
+    pixels = np.random.default_rng(seed).integers(0, 256, (48, 64, 3), np.uint8)
+    if kind == "DNG":
+        return dng(pixels)
+    return heic(pixels, Heic(1, phone_exif(5.0, 26), icc=rgb_profile(DISPLAY_P3_XYZ, None)))
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "AVIF", "HEIC", "DNG"])
 def test_damaged_pictures(tmp_path: Path, kind: str) -> None:
     """One of twelve photos is damaged: it is left out, or shows what is left of it."""
-    files: Files = {f"{n}.x": picture(seed=n, kind=kind) for n in range(12)}
-    victim = picture(seed=5, kind=kind)
+    files: Files = {f"{n}.x": picture(seed=n) for n in range(12)}
+    victim = photo(5, kind)
     found = Counter(
         outcome(tmp_path / str(n), zipped(tmp_path, files | {"5.x": changed}, 0))
         for n, changed in enumerate(mutations(victim[:700], 25, 4))
@@ -236,6 +250,29 @@ def test_damaged_pictures(tmp_path: Path, kind: str) -> None:
         for n, changed in enumerate(mutations(victim, 15, 5))
     )
     assert set(found) == {"images"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [
+        ("HEIC", (16_000, 16_000)),
+        ("HEIC", (8, 8)),
+        ("HEIC", (0, 1 << 31)),
+        ("DNG", (12_000, 12_000)),
+        ("DNG", (1 << 16, 1 << 16)),
+        ("DNG", (0, 64)),
+    ],
+)
+def test_photos_of_other_sizes_than_they_declare(
+    tmp_path: Path, kind: str, size: tuple[int, int]
+) -> None:
+    """A few bytes that claim gigabytes: refused before any is taken, with what and why."""
+    pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    lie = heic(pixels, Heic(size=size)) if kind == "HEIC" else dng(pixels, Dng(size=size))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    data = zipped(tmp_path, {f"{n}.x": lie + bytes([n]) for n in range(9)}, 0)
+    assert outcome(tmp_path / "job", data) == "image_undecodable"
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 << 10  # KiB
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])

@@ -90,11 +90,11 @@ def test_further_poses_beside_those_that_are_read_are_named(
 def test_videos_and_unreadable_formats_in_an_archive_are_told(tmp_path: Path) -> None:
     files: Files = {
         "clip.mp4": b"\x00\x00\x00\x20ftypisom" + bytes(40),
-        "a.dng": b"II*\x00" + bytes(40),
+        "a.gif": b"GIF89a" + bytes(40),
     }
-    clip, raw = sorted(told(tmp_path, files), key=lambda text: "raw" in text)
+    clip, gif = sorted(told(tmp_path, files), key=lambda text: "GIF" in text)
     assert clip.startswith("1 video (clip.mp4) was not used: videos are read where")
-    assert raw.startswith("1 TIFF or camera raw picture (a.dng) was not used: ")
+    assert gif.startswith("1 GIF picture (a.gif) was not used: GIF is not read, convert")
 
 
 def test_record_and_summary_hold_the_counts(tmp_path: Path) -> None:

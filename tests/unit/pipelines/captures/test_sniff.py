@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.captures.archive_rules import ArchiveLimits, open_archive
+from pipelines.captures.magic import image_format, video_container
 from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError
 from tests.unit.pipelines.captures.archives import (
@@ -187,11 +188,46 @@ def test_zip_without_pictures_is_refused(tmp_path: Path) -> None:
     assert code_of(write_zip(tmp_path / "d", {})) == "no_images"
 
 
-def test_zip_of_heic_names_the_format(tmp_path: Path) -> None:
-    path = write_zip(tmp_path / "c", {"a.jpg": b"\x00\x00\x00\x18ftypheic" + bytes(40)})
+@pytest.mark.parametrize(
+    ("head", "format_name"),
+    [
+        (b"GIF89a", "GIF"),
+        (b"\xff\x0a", "JPEG XL"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL"),
+        (b"\0\0\0\x0cjP  \r\n\x87\n", "JPEG 2000"),
+    ],
+)
+def test_zip_of_pictures_that_are_not_read_names_the_format(
+    tmp_path: Path, head: bytes, format_name: str
+) -> None:
+    path = write_zip(tmp_path / "c", {"a.jpg": head + bytes(40)})
     with pytest.raises(CaptureError) as caught:
         sniff(path, "c.zip")
-    assert (caught.value.code, "HEIC" in caught.value.hint) == ("no_images", True)
+    assert (caught.value.code, format_name in caught.value.hint) == ("no_images", True)
+
+
+@pytest.mark.parametrize(
+    ("head", "kind"),
+    [
+        (b"\0\0\0\x18ftypheic", "HEIF"),
+        (b"\0\0\0\x1cftypmif1\0\0\0\0mif1heicmiaf", "HEIF"),
+        (b"\0\0\0\x1cftypmif1\0\0\0\0mif1avifmiaf", "AVIF"),
+        (b"\0\0\0\x14ftypmif1\0\0\0\0mif1avif", "HEIF"),  # behind the box is no brand
+        (b"\0\0\0\x18ftypavif", "AVIF"),
+        (b"\0\0\0\x18ftypcrx ", "RAW"),
+        (b"FUJIFILMCCD-RAW 0201", "RAW"),
+        (b"IIU\0\x18\0\0\0", "RAW"),
+        (b"II*\0\x08\0\0\0", "TIFF"),
+        (b"MM\0*\0\0\0\x08", "TIFF"),
+        (b"\0\0\0\x18ftypqt  ", None),
+        (b"\0\0\0\x18ftypisom", None),
+    ],
+)
+def test_photos_of_phones_and_cameras_are_told_apart_from_films(
+    head: bytes, kind: str | None
+) -> None:
+    assert image_format(head + bytes(40)) == kind
+    assert (video_container(head + bytes(40)) == "mov") == (head[4:8] == b"ftyp" and kind is None)
 
 
 @pytest.mark.parametrize(

@@ -122,14 +122,13 @@ def test_posed_captures_need_what_training_needs(tmp_path: Path) -> None:
     assert summary["num_posed"] == MIN_POSED_IMAGES
 
 
-def test_heic_pictures_are_named_with_what_to_do(tmp_path: Path) -> None:
-    heic = b"\x00\x00\x00\x18ftypheic" + bytes(40)
-    files: Files = {f"{n}.HEIC": heic for n in range(60)}
+def test_pictures_that_are_not_read_are_named_with_what_to_do(tmp_path: Path) -> None:
+    files: Files = {f"{n}.gif": b"GIF89a" + bytes(40) for n in range(60)}
     few = failure(tmp_path / "a", files | {f"{n}.jpg": picture(seed=n) for n in range(3)})
     assert few.code == "too_few_images"
-    assert "60 HEIC pictures at the top were not used: HEIC is not read, convert" in few.message
+    assert "60 GIF pictures at the top were not used: GIF is not read, convert" in few.message
     enough, _ = ingest(tmp_path / "b", files | {f"{n}.jpg": picture(seed=n) for n in range(8)})
-    assert warning_with(enough, "60 HEIC pictures", "convert")
+    assert warning_with(enough, "60 GIF pictures", "convert")
 
 
 def test_entry_that_holds_more_than_it_declares_is_stopped(tmp_path: Path) -> None:
