@@ -228,6 +228,19 @@ def service(tmp_path: Path) -> Iterator[Service]:
         yield made
 
 
+@pytest.fixture(
+    scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.services)]
+)
+def served(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Service]:
+    """A service on either database, one for all tests of a file."""
+    url = "" if request.param == "sqlite" else request.getfixturevalue("postgres_module_url")
+    home = tmp_path_factory.mktemp("home")
+    with serving(settings_for(home, database_url=url, check_timeout_s=0.2)) as made:
+        yield made
+
+
 @pytest.fixture
 def live(tmp_path: Path) -> Iterator[LiveServer]:
     """A live server."""

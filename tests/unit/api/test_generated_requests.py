@@ -9,13 +9,11 @@ failure comes again.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import quote, urlencode
 
 import httpx
-import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
@@ -31,29 +29,15 @@ from schemathesis.specs.openapi.checks import (
 from tests.unit.api.conftest import (
     Service,
     finish_job,
-    serving,
-    settings_for,
     zip_of_pictures,
 )
 
 EXAMPLES = 9
 JSON = {"Content-Type": "application/json"}
-POSTGRESQL = pytest.param("postgresql", marks=pytest.mark.services)
 ODD = st.sampled_from(["\0", "\ud800", "a\0b", "\udfff\ud800", "ä", "\U0001f419", "%00", "'", ""])
 ODD_HEADS = ("Idempotency-Key", "X-Request-Id", "Range", "If-None-Match", "Accept")
 NEEDS_A_BROKER = {"get_readiness"}
 """Nothing listens at this service's broker: the answer is a documented 503."""
-
-
-@pytest.fixture(scope="module", params=["sqlite", POSTGRESQL])
-def running(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Service]:
-    """A service on either database."""
-    url = "" if request.param == "sqlite" else request.getfixturevalue("postgres_module_url")
-    home = tmp_path_factory.mktemp("generated")
-    with serving(settings_for(home, database_url=url, check_timeout_s=0.2)) as service:
-        yield service
 
 
 def with_odd_text(value: Any, draw: Any) -> Any:
@@ -219,9 +203,9 @@ def send_generated(target: Target, operation: Any, name: str) -> set[int]:
     return statuses
 
 
-def test_generated_requests_are_answered_as_documented(running: Service) -> None:
+def test_generated_requests_are_answered_as_documented(served: Service) -> None:
     load_all_checks()
-    target = Target.of(running)
+    target = Target.of(served)
     schema = schemathesis.openapi.from_dict(target.document)
     schema.config.generation.update(modes=[GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
     statuses: set[int] = set()
@@ -291,9 +275,9 @@ def links_of(target: Target, operation: str, status: int) -> list[dict[str, Any]
     raise AssertionError(operation)
 
 
-def test_every_link_leads_where_it_says(running: Service) -> None:
+def test_every_link_leads_where_it_says(served: Service) -> None:
     """From an upload on, along all links of all answers that have any, and each of them works."""
-    target = Target.of(running)
+    target = Target.of(served)
     walked: set[tuple[str, str]] = set()
 
     def walk(operation: str, answer: httpx.Response) -> None:
@@ -303,8 +287,8 @@ def test_every_link_leads_where_it_says(running: Service) -> None:
             if (operation, named) in walked:
                 continue
             if named == "delete_capture":  # what runs on it has to be over
-                for job in running.http.get("/v1/jobs?limit=100").json()["items"]:
-                    running.http.post(f"/v1/jobs/{job['id']}/cancel")
+                for job in served.http.get("/v1/jobs?limit=100").json()["items"]:
+                    served.http.post(f"/v1/jobs/{job['id']}/cancel")
             walked.add((operation, named))
             following = follow(target, operation, link, made)
             if following.status_code in (201, 202) and named not in ("cancel_job", "retry_job"):
@@ -313,10 +297,10 @@ def test_every_link_leads_where_it_says(running: Service) -> None:
     for operation in ("create_capture", "create_export"):
         if operation == "create_capture":
             files = {"file": ("photos.zip", zip_of_pictures())}
-            answer = running.http.post("/v1/captures", files=files)
+            answer = served.http.post("/v1/captures", files=files)
         else:
             address = f"/v1/jobs/{target.done['id']}/exports"
-            answer = running.http.post(address, json={"kind": "mesh"})
+            answer = served.http.post(address, json={"kind": "mesh"})
         walk(operation, answer)
     stated = {
         (call["operationId"], link["operationId"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
 from typing import Any
 from urllib.parse import quote
 
@@ -12,19 +11,7 @@ import httpx
 import pytest
 
 from storage.models import new_id
-from tests.unit.api.conftest import Service, problem, serving, settings_for, zip_of_pictures
-
-
-@pytest.fixture(
-    scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.services)]
-)
-def odd(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Service]:
-    """A service on either database, one for all tests of this file."""
-    url = "" if request.param == "sqlite" else request.getfixturevalue("postgres_module_url")
-    with serving(settings_for(tmp_path_factory.mktemp("odd"), database_url=url)) as service:
-        yield service
+from tests.unit.api.conftest import Service, problem, zip_of_pictures
 
 
 def cursor(*values: Any) -> str:
@@ -51,18 +38,18 @@ IDS = (
         "/v1/jobs/{}/artifacts/mesh.glb",
     ],
 )
-def test_what_is_no_id_is_not_found(odd: Service, path: str) -> None:
+def test_what_is_no_id_is_not_found(served: Service, path: str) -> None:
     for text in (*IDS, NOBODY):
-        answer = odd.http.get(path.format(text))
+        answer = served.http.get(path.format(text))
         assert answer.status_code == 404, (text, answer.text)
         assert answer.json()["code"].endswith("not_found")
 
 
 @pytest.mark.parametrize("method", ["DELETE", "POST"])
-def test_changing_what_is_no_id_is_not_found(odd: Service, method: str) -> None:
+def test_changing_what_is_no_id_is_not_found(served: Service, method: str) -> None:
     for text in IDS:
         path = f"/v1/jobs/{text}" + ("/cancel" if method == "POST" else "")
-        assert odd.http.request(method, path).status_code == 404, text
+        assert served.http.request(method, path).status_code == 404, text
 
 
 WHEN = "2026-01-01T00:00:00+00:00"
@@ -80,15 +67,15 @@ CURSORS = (
 
 
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/captures"])
-def test_what_is_no_cursor_is_refused(odd: Service, path: str) -> None:
+def test_what_is_no_cursor_is_refused(served: Service, path: str) -> None:
     for text in CURSORS:
-        answer = odd.http.get(path, params={"cursor": text})
+        answer = served.http.get(path, params={"cursor": text})
         assert problem(answer, 422, answer.json()["code"])["code"] in (
             "cursor_invalid",
             "request_invalid",
         ), text
     real = cursor("9999-12-31T00:00:00+00:00", NOBODY)
-    assert odd.http.get(path, params={"cursor": real}).status_code == 200
+    assert served.http.get(path, params={"cursor": real}).status_code == 200
 
 
 LABELS = (
@@ -109,12 +96,12 @@ LABELS = (
 )
 
 
-def test_labels_that_are_none_are_refused_and_odd_ones_find_nothing(odd: Service) -> None:
+def test_labels_that_are_none_are_refused_and_odd_ones_find_nothing(served: Service) -> None:
     for text in LABELS:
-        answer = odd.http.get(f"/v1/jobs?label={text if '%' in text else quote(text)}")
+        answer = served.http.get(f"/v1/jobs?label={text if '%' in text else quote(text)}")
         assert answer.status_code == 422, (text, answer.text)
     for text in ("a=", "a=%27", "a.b/c-d_e=1", "a==", f"a={HALF}", "a=%F0%9F%90%99", "a=%25"):
-        answer = odd.http.get(f"/v1/jobs?label={text}")
+        answer = served.http.get(f"/v1/jobs?label={text}")
         assert (answer.status_code, answer.json()["items"]) == (200, []), text
 
 
@@ -141,13 +128,13 @@ BODIES: tuple[Any, ...] = (
 )
 
 
-def test_bodies_that_no_job_can_be_made_of_are_refused(odd: Service) -> None:
-    capture = odd.upload()["id"]
+def test_bodies_that_no_job_can_be_made_of_are_refused(served: Service) -> None:
+    capture = served.upload()["id"]
     for body in BODIES:
         for capture_id in {body["capture_id"], capture if body["capture_id"] == NOBODY else ""} - {
             ""
         }:
-            answer = odd.http.post(
+            answer = served.http.post(
                 "/v1/jobs",
                 content=json.dumps({**body, "capture_id": capture_id}),
                 headers={"Content-Type": "application/json"},
@@ -157,27 +144,27 @@ def test_bodies_that_no_job_can_be_made_of_are_refused(odd: Service) -> None:
             assert len(answer.content) < 20_000, "an error answer grows with what was sent"
             assert len(found["errors"]) <= 50
     for content in (b"[" * 100_000, b"1" * 5000, b'{"capture_id": ' + b"1" * 5000, b"\xff", b"NaN"):
-        answer = odd.http.post(
+        answer = served.http.post(
             "/v1/jobs", content=content, headers={"Content-Type": "application/json"}
         )
         assert answer.status_code in (400, 422), content[:20]
 
 
-def test_bodies_that_no_retry_can_be_made_of_are_refused(odd: Service) -> None:
-    job = odd.job(preset="preview")["id"]
-    odd.http.post(f"/v1/jobs/{job}/cancel")
+def test_bodies_that_no_retry_can_be_made_of_are_refused(served: Service) -> None:
+    job = served.job(preset="preview")["id"]
+    served.http.post(f"/v1/jobs/{job}/cancel")
     wishes = [{"options": body["options"]} for body in BODIES if "options" in body]
     for body in (*wishes, {"from_stage": "\ud800"}, {"from_stage": "\0"}, {"\ud800": 1}):
-        answer = odd.http.post(
+        answer = served.http.post(
             f"/v1/jobs/{job}/retry",
             content=json.dumps(body),
             headers={"Content-Type": "application/json"},
         )
         problem(answer, 422, answer.json()["code"])
-    assert odd.http.get(f"/v1/jobs/{job}").json()["state"] == "cancelled"
+    assert served.http.get(f"/v1/jobs/{job}").json()["state"] == "cancelled"
 
 
-def test_odd_forms_are_refused(odd: Service) -> None:
+def test_odd_forms_are_refused(served: Service) -> None:
     for kind in (
         *(
             "multipart/form-data",
@@ -187,7 +174,7 @@ def test_odd_forms_are_refused(odd: Service) -> None:
         *("multipart/form-data; boundary*=x''y", "\xb2", 'multipart/form-data; boundary="a\\', ";"),
         "multipart/form-data; boundary=" + "x" * 300,
     ):
-        answer = odd.http.post(
+        answer = served.http.post(
             "/v1/captures",
             content=b"--a\r\n\r\n",
             headers=[(b"content-type", kind.encode("latin-1"))],
@@ -197,7 +184,7 @@ def test_odd_forms_are_refused(odd: Service) -> None:
         content = name.encode("utf-8", "surrogatepass")
         body = b'--b\r\nContent-Disposition: form-data; name="file"; filename="' + content
         body += b'"\r\n\r\n' + zip_of_pictures(1) + b"\r\n--b--\r\n"
-        answer = odd.http.post(
+        answer = served.http.post(
             "/v1/captures",
             content=body,
             headers={"Content-Type": "multipart/form-data; boundary=b"},
@@ -205,8 +192,8 @@ def test_odd_forms_are_refused(odd: Service) -> None:
         assert answer.status_code in (201, 422), (name, answer.text)
 
 
-def test_every_address_names_all_its_methods_and_answers_head(odd: Service) -> None:
-    job = odd.job()["id"]
+def test_every_address_names_all_its_methods_and_answers_head(served: Service) -> None:
+    job = served.job()["id"]
     for path, allowed in (
         ("/v1/jobs", "GET, HEAD, POST"),
         (f"/v1/jobs/{job}", "DELETE, GET, HEAD"),
@@ -220,7 +207,7 @@ def test_every_address_names_all_its_methods_and_answers_head(odd: Service) -> N
         ("/openapi.json", "GET, HEAD"),
     ):
         for method in ("PATCH", "TRACE", "OPTIONS", "BREW"):
-            answer = odd.http.request(method, path)
+            answer = served.http.request(method, path)
             problem(answer, 405, "method_not_allowed")
             assert answer.headers["allow"] == allowed, path
     for path in (
@@ -232,14 +219,14 @@ def test_every_address_names_all_its_methods_and_answers_head(odd: Service) -> N
         "/docs",
         "/openapi.json",
     ):
-        head, whole = odd.http.head(path), odd.http.get(path)
+        head, whole = served.http.head(path), served.http.get(path)
         assert (head.status_code, head.content) == (200, b""), path
         assert head.headers["content-length"] == str(len(whole.content)), path
-    refused = odd.http.head(f"/v1/jobs/{NOBODY}")
+    refused = served.http.head(f"/v1/jobs/{NOBODY}")
     assert (refused.status_code, refused.content) == (404, b"")
 
 
-def test_odd_heads_are_no_fault_of_the_service(odd: Service) -> None:
+def test_odd_heads_are_no_fault_of_the_service(served: Service) -> None:
     for name, text in (
         ("authorization", b"Bearer \xff\xfe"),
         ("X-Request-Id", b"\xff"),
@@ -249,9 +236,9 @@ def test_odd_heads_are_no_fault_of_the_service(odd: Service) -> None:
         ("Cookie", b"\xff"),
     ):
         answer = httpx.get(
-            str(odd.http.base_url.join("/v1/jobs")),
+            str(served.http.base_url.join("/v1/jobs")),
             headers=[
-                *((key, value) for key, value in odd.http.headers.raw if key != name.encode()),
+                *((key, value) for key, value in served.http.headers.raw if key != name.encode()),
                 (name.encode(), text),
             ],
         )

@@ -14,19 +14,7 @@ import sqlalchemy as sa
 
 from storage.api_keys import create_api_key
 from storage.models import Base
-from tests.unit.api.conftest import Service, finish_job, serving, settings_for, zip_of_pictures
-
-POSTGRESQL = pytest.param("postgresql", marks=pytest.mark.services)
-
-
-@pytest.fixture(scope="module", params=["sqlite", POSTGRESQL])
-def served(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Service]:
-    """A service on either database, one for all tests of this file."""
-    url = "" if request.param == "sqlite" else request.getfixturevalue("postgres_module_url")
-    with serving(settings_for(tmp_path_factory.mktemp("tenants"), database_url=url)) as service:
-        yield service
+from tests.unit.api.conftest import Service, finish_job, zip_of_pictures
 
 
 @pytest.fixture(scope="module")

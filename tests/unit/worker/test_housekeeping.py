@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from storage.bell import Bell
-from storage.claims import claim_stage
+from storage.claims import Claim, claim_stage
 from storage.db import Database, now
 from storage.jobs import request_cancel, stage_id
 from storage.leases import cancel_stage, heartbeat
@@ -227,28 +227,41 @@ def test_a_reaper_that_was_away_gives_all_their_turn_before_it_reaps(
     assert [grace.is_over(T0 + timedelta(seconds=at)) for at in rounds_s] == believed
 
 
+def at(seconds: float) -> datetime:
+    """So long after T0."""
+    return T0 + timedelta(seconds=seconds)
+
+
+def two_claims(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[list[Claim], Callable[[float], list[str]]]:
+    """Two stages that are claimed at T0 for 60 s, and a reaper of them.
+
+    It has one round, so many seconds after T0 by its clock, and tells their states then.
+    """
+    with database.session_scope() as session:
+        made = [
+            claim_stage(session, stage_id(make_job(session).id, "first"), "w", 60.0, when=T0)
+            for _ in range(2)
+        ]
+    claims = [claim for claim in made if claim is not None]
+    assert len(claims) == 2
+    keeper = keeper_of(database, tmp_path)
+
+    def reap(at_s: float) -> list[str]:
+        monkeypatch.setattr("worker.housekeeping.now", lambda session: at(at_s))
+        keeper.reap()
+        with database.read_scope() as session:
+            return [session.get_one(StageRow, claim.stage_id).state for claim in claims]
+
+    return claims, reap
+
+
 def test_a_machine_that_slept_loses_no_lease_but_one_whose_worker_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     database = make_database(tmp_path)
-    with database.session_scope() as session:
-        lives, gone = (
-            claim_stage(session, stage_id(make_job(session).id, "first"), "w", 60.0, when=T0)
-            for _ in range(2)
-        )
-    assert lives is not None
-    assert gone is not None
-    keeper = keeper_of(database, tmp_path)
-
-    def reap(at_s: float) -> list[str | None]:
-        monkeypatch.setattr("worker.housekeeping.now", lambda session: at(at_s))
-        keeper.reap()
-        with database.read_scope() as session:
-            return [session.get_one(StageRow, claim.stage_id).state for claim in (lives, gone)]
-
-    def at(seconds: float) -> datetime:
-        return T0 + timedelta(seconds=seconds)
-
+    (lives, _), reap = two_claims(database, tmp_path, monkeypatch)
     assert reap(2) == ["running", "running"]
     assert reap(3600) == ["running", "running"]
     with database.session_scope() as session:
@@ -263,24 +276,7 @@ def test_a_clock_that_goes_back_an_hour_leaves_no_lease_for_an_hour(
 ) -> None:
     """Also where the reaper was away before: the grace that it gave ends in its time."""
     database = make_database(tmp_path)
-    with database.session_scope() as session:
-        lives, gone = (
-            claim_stage(session, stage_id(make_job(session).id, "first"), "w", 60.0, when=T0)
-            for _ in range(2)
-        )
-    assert lives is not None
-    assert gone is not None
-    keeper = keeper_of(database, tmp_path)
-
-    def at(seconds: float) -> datetime:
-        return T0 + timedelta(seconds=seconds)
-
-    def reap(at_s: float) -> list[str]:
-        monkeypatch.setattr("worker.housekeeping.now", lambda session: at(at_s))
-        keeper.reap()
-        with database.read_scope() as session:
-            return [session.get_one(StageRow, claim.stage_id).state for claim in (lives, gone)]
-
+    (lives, _), reap = two_claims(database, tmp_path, monkeypatch)
     assert reap(2) == ["running", "running"]
     assert reap(40) == ["running", "running"]
     assert reap(40 - 3600) == ["running", "running"]
