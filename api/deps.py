@@ -19,7 +19,7 @@ from api.problems import UnauthorizedError, UnavailableError
 from api.settings import ApiSettings
 from storage.api_keys import find_api_key, is_use_due, touch_api_key
 from storage.bell import Bell
-from storage.db import Database, now
+from storage.db import Database
 from storage.deletions import Drainer
 from storage.objects import ObjectStore
 
@@ -128,10 +128,10 @@ def require_key(
     if len(key) > MAX_KEY_CHARS:
         raise UnauthorizedError("The API key is not valid.")
     with services.database.read_scope() as session:
-        record = find_api_key(session, key)
-        if record is None:
-            raise UnauthorizedError("The API key is not valid.")
-        caller, due = Caller(record.id, record.tenant_id), is_use_due(record, now(session))
+        found = find_api_key(session, key)
+    if found is None:
+        raise UnauthorizedError("The API key is not valid.")
+    caller, due = Caller(found[0].id, found[0].tenant_id), is_use_due(*found)
     if due:
         with services.database.session_scope() as session:
             touch_api_key(session, caller.id)

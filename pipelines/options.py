@@ -8,6 +8,7 @@ Unknown keys and values out of range are refused. No torch is imported.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 from collections.abc import Collection
 from typing import Any, Literal
@@ -332,6 +333,12 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
+@functools.cache
+def _defaults(model: type[StageOptions]) -> dict[str, Any]:
+    """All options of a stage as they are where nobody says more. For reading alone: it is kept."""
+    return model().model_dump(mode="json")
+
+
 def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Complete, checked, JSON-able options of all stages.
 
@@ -358,7 +365,7 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
             if name == "train":
                 model, base, wanted["train"] = _train_ground(given, wanted.get("train", {}))
             else:
-                base = model().model_dump(mode="json")
+                base = _defaults(model)
             checked = model.model_validate(merge(merge(base, wanted.get(name, {})), given))
             if name == "train":
                 validate(train_config(checked))
@@ -423,7 +430,7 @@ def _train_ground(
     """
     method = str(given.get("method", NERFACTO.name))
     model = train_options(method)
-    base = model().model_dump(mode="json")
+    base = _defaults(model)
     if method != NERFACTO.name:
         wanted = {key: value for key, value in wanted.items() if key not in ("model", "optimizer")}
     return model, base, wanted

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from storage.db import now
+from storage.db import first_and_now, now
 from storage.errors import NotFoundError
 from storage.models import ApiKey
 from storage.new_keys import new_api_key
@@ -41,10 +41,10 @@ def ensure_api_key(
     return found
 
 
-def find_api_key(session: Session, key: str) -> ApiKey | None:
-    """The record of a key that is valid, or None for one that is unknown or revoked."""
+def find_api_key(session: Session, key: str) -> tuple[ApiKey, datetime] | None:
+    """The record of a key that is valid, and the time; None for one that is unknown or revoked."""
     query = select(ApiKey).where(ApiKey.sha256 == _digest(key), ApiKey.revoked_at.is_(None))
-    return session.scalar(query)
+    return first_and_now(session, query)
 
 
 def is_use_due(record: ApiKey, when: datetime) -> bool:

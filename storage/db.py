@@ -27,6 +27,7 @@ from sqlalchemy import (
     DateTime,
     Dialect,
     Engine,
+    Select,
     String,
     TypeDecorator,
     create_engine,
@@ -141,6 +142,16 @@ def now(session: Session) -> datetime:
     return datetime.now(UTC)
 
 
+def first_and_now(session: Session, query: Select[Any]) -> tuple[Any, datetime] | None:
+    """The first that a query finds, with the time by `now`: in one exchange, not two."""
+    if session.get_bind().dialect.name != "postgresql":
+        found = session.scalars(query.limit(1)).first()
+        return None if found is None else (found, now(session))
+    moment = func.clock_timestamp(type_=UtcDateTime())
+    both = session.execute(query.add_columns(moment).limit(1)).first()
+    return None if both is None else (both[0], both[1])
+
+
 def name_actor(session: Session, actor: str) -> None:
     """Say who changes something in this session, unless that was said before."""
     session.info.setdefault(ACTOR, actor)
@@ -212,9 +223,7 @@ def make_engine(url: str, deadline_s: float = STATEMENT_S) -> Engine:
         return engine
     if parsed.drivername != "postgresql+psycopg":
         raise ValueError(f"no database of kind {parsed.drivername}: use sqlite or postgresql")
-    engine = create_engine(
-        parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_timeout=POOL_S
-    )
+    engine = create_engine(parsed, pool_size=5, max_overflow=15, pool_timeout=POOL_S)
     bound(engine, deadline_s)
     return engine
 
@@ -227,9 +236,12 @@ class Database:
         self.engine = make_engine(url, deadline_s)
         self._turns = Turns() if self.engine.dialect.name == "sqlite" else None
         self._write = sessionmaker(self.engine, expire_on_commit=False)
-        self._read = sessionmaker(
-            self.engine.execution_options(nerfworks_read_only=True), expire_on_commit=False
-        )
+        reading: dict[str, Any] = {"nerfworks_read_only": True}
+        if self.engine.dialect.name == "postgresql":
+            # Each statement sees what is committed when it begins, in a transaction or not: so
+            # those who only read are spared the exchanges that begin one and end it.
+            reading["isolation_level"] = "AUTOCOMMIT"
+        self._read = sessionmaker(self.engine.execution_options(**reading), expire_on_commit=False)
         watch(self._write)
         watch(self._read)
         self._tenant_id: str | None = None

@@ -43,8 +43,9 @@ def create(
             needs_gpu=stage.needs_gpu,
             labels=wanted.labels,
         )
-        ready.extend(jobs.ready_stage_ids(export))
-        return view(services, session, export.id, request), f"/v1/jobs/{export.id}"
+        made = view(services, session, export.id, request)
+        ready.extend(jobs.ready_stage_ids(export))  # which the view has loaded
+        return made, f"/v1/jobs/{export.id}"
 
     done = do_once(services, once, 202, make)
     if not done.is_replayed:

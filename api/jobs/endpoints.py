@@ -41,10 +41,16 @@ LINKS = {
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 
-def _hint_poll(response: Response, job: JobView) -> None:
-    response.headers["Cache-Control"] = "no-store"
+def _polled(job: JobView, status: int = 200) -> Response:
+    """A job as the answer to who asks for it again and again.
+
+    Written here, in the endpoint's own thread: a view that is returned is checked once more in
+    another one, and written in the one that serves all connections.
+    """
+    headers = {"Cache-Control": "no-store"}
     if job.state not in JOB_TERMINAL:
-        response.headers["Retry-After"] = POLL_S
+        headers["Retry-After"] = POLL_S
+    return Response(job.model_dump_json(), status, headers, media_type="application/json")
 
 
 @router.post(
@@ -92,31 +98,28 @@ def list_jobs(
         return JobPage(items=[JobSummary.of(job) for job in found], next_cursor=following)
 
 
-@router.get("/{job_id}", responses=responses("job_not_found"))
-def get_job(job_id: JobId, services: ServicesDep, request: Request, response: Response) -> JobView:
+@router.get("/{job_id}", responses=responses("job_not_found"), response_model=JobView)
+def get_job(job_id: JobId, services: ServicesDep, request: Request) -> Response:
     """One job: state, stages with progress and time left, metrics, error, artifacts."""
     with services.database.read_scope() as session:
         job = service.view(services, session, job_id, request)
-    _hint_poll(response, job)
-    return job
+    return _polled(job)
 
 
 @router.post(
-    "/{job_id}/cancel", status_code=202, responses=responses("job_not_found", "job_finished")
+    "/{job_id}/cancel",
+    status_code=202,
+    responses=responses("job_not_found", "job_finished"),
+    response_model=JobView,
 )
 def cancel_job(
-    job_id: JobId,
-    services: ServicesDep,
-    caller: CallerDep,
-    request: Request,
-    response: Response,
-) -> JobView:
+    job_id: JobId, services: ServicesDep, caller: CallerDep, request: Request
+) -> Response:
     """Ask a job to stop; asking twice changes nothing. The running stage stops within 10 s."""
     service.cancel(services, job_id, caller)
     with services.database.read_scope() as session:
         job = service.view(services, session, job_id, request)
-    _hint_poll(response, job)
-    return job
+    return _polled(job, 202)
 
 
 @router.post(

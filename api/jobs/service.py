@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from datetime import datetime
 
 from fastapi import Request
 from sqlalchemy.orm import Session
@@ -18,6 +19,7 @@ from pipelines.options import resolve_options, stages_skipped
 from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, STAGES
 from storage import jobs, queries, records
+from storage.db import now
 from storage.jobs import StageSeed
 from storage.models import Job
 
@@ -25,17 +27,19 @@ PRESET_WITH_GPU = "standard"
 PRESET_WITHOUT_GPU = "preview"
 
 
-def default_preset(session: Session) -> tuple[str, str]:
+def default_preset(session: Session, when: datetime | None = None) -> tuple[str, str]:
     """The preset of a job that names none, and why it is that one."""
-    if records.has_live_gpu(session):
+    if records.has_live_gpu(session, when):
         return PRESET_WITH_GPU, "no preset was asked for, and a GPU worker is registered"
     return PRESET_WITHOUT_GPU, "no preset was asked for, and no GPU worker is registered"
 
 
-def choose_preset(session: Session, asked: str | None) -> tuple[str, str]:
+def choose_preset(
+    session: Session, asked: str | None, when: datetime | None = None
+) -> tuple[str, str]:
     """The preset and the reason. Raises InvalidRequestError for one that does not exist."""
     if asked is None:
-        return default_preset(session)
+        return default_preset(session, when)
     if asked not in PRESETS:
         known = ", ".join(PRESETS)
         raise InvalidRequestError(
@@ -81,8 +85,9 @@ def create(services: Services, wanted: JobRequest, once: Once, request: Request)
     ready: list[str] = []
 
     def make(session: Session) -> tuple[JobView, str]:
+        when = now(session)
         kind = records.get_capture(session, wanted.capture_id).kind
-        preset, reason = choose_preset(session, wanted.preset)
+        preset, reason = choose_preset(session, wanted.preset, when)
         job = jobs.create_job(
             session,
             capture_id=wanted.capture_id,
@@ -91,9 +96,11 @@ def create(services: Services, wanted: JobRequest, once: Once, request: Request)
             options=resolve_options(preset, wanted.options),
             stages=stage_seeds(preset, kind, wanted.options),
             labels=wanted.labels,
+            when=when,
         )
-        ready.extend(jobs.ready_stage_ids(job))
-        return view(services, session, job.id, request), f"/v1/jobs/{job.id}"
+        made = view(services, session, job.id, request)
+        ready.extend(jobs.ready_stage_ids(job))  # which the view has loaded
+        return made, f"/v1/jobs/{job.id}"
 
     done = do_once(services, once, 202, make)
     if not done.is_replayed:

@@ -9,6 +9,7 @@ methods are in `options.methods`.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import typing
 from dataclasses import dataclass, field
 from typing import Any
@@ -201,12 +202,17 @@ def _check_fields(config: Any, path: str) -> None:
                 raise bad_option(name, value, f"{low} to {high}")
 
 
+@functools.cache
+def _hints(cls: Any) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
+
+
 def config_from_dict(cls: Any, values: dict[str, Any]) -> Any:
     """The inverse of `dataclasses.asdict` for the classes here, also after a trip through JSON.
 
     Raises NerfError `bad_config` for an unknown option.
     """
-    hints = typing.get_type_hints(cls)
+    hints = dict(_hints(cls))
     if cls is TrainConfig:
         hints["model"] = find_method(values.get("method", "nerfacto")).config
     made: dict[str, Any] = {}

@@ -9,7 +9,7 @@ import pytest
 
 from storage import api_keys
 from storage.claims import Claim, claim_stage
-from storage.db import Database
+from storage.db import Database, now
 from storage.deletions import drain_deletions
 from storage.errors import ConflictError, InvalidCursorError, NotFoundError
 from storage.jobs import request_cancel, stage_id
@@ -193,11 +193,13 @@ def test_only_the_hash_of_a_key_is_kept_and_a_revoked_key_is_unknown(database: D
         assert api_keys.ensure_api_key(session, key, "again").id == record.id
         found = api_keys.find_api_key(session, key)
         assert found is not None
-        assert api_keys.is_use_due(found, T0)
-        api_keys.touch_api_key(session, found.id)
+        mine, when = found
+        assert abs(when - now(session)) < timedelta(seconds=30)
+        assert api_keys.is_use_due(mine, when)
+        api_keys.touch_api_key(session, mine.id)
         session.flush()
-        assert found.last_used_at is not None
-        assert not api_keys.is_use_due(found, found.last_used_at + timedelta(seconds=5))
+        assert mine.last_used_at is not None
+        assert not api_keys.is_use_due(mine, mine.last_used_at + timedelta(seconds=5))
         assert api_keys.find_api_key(session, key + "x") is None
         api_keys.revoke_api_key(session, record.id)
         assert api_keys.find_api_key(session, key) is None
