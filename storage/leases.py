@@ -18,12 +18,14 @@ from datetime import datetime, timedelta
 from typing import Any, cast
 
 from sqlalchemy import ColumnElement, CursorResult, select, update
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from storage.claims import Claim
 from storage.db import name_actor, now
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
 from storage.models import Job, StageRow, StageRun
+from storage.postgres import is_locked
 from storage.runs import RunEnd, count_checkpoint, count_ends, run_of
 from storage.transitions import fail_for_good, lock_job, set_stage, settle
 
@@ -308,18 +310,35 @@ def cancel_stage(session: Session, claim: Claim, when: datetime | None = None) -
     return "cancelled"
 
 
+def _lock_if_free(session: Session, job_id: str) -> tuple[Job, list[StageRow]] | None:
+    """`lock_job`; None where another holds one of the rows, or deleted the job meanwhile."""
+    try:
+        with session.begin_nested():
+            return lock_job(session, job_id, nowait=True)
+    except NotFoundError:
+        return None
+    except OperationalError as error:
+        if not is_locked(error):
+            raise
+        return None
+
+
 def _lose_all(
-    session: Session, lost: ColumnElement[bool], when: datetime, reason: str
+    session: Session, lost: ColumnElement[bool], when: datetime, reason: str, *, wait: bool
 ) -> list[str]:
     """Lose the leases that a condition finds, job by job in one order. Ids that are ready again.
 
     What was found is looked at again under the job's lock: a heartbeat may have come between.
+    wait: for who has a job locked; else it is passed over.
     """
     running = (StageRow.state == "running") & lost
     job_ids = session.scalars(select(StageRow.job_id).where(running).distinct())
     ready = []
     for job_id in sorted(job_ids):
-        job, stages = lock_job(session, job_id)
+        locked = lock_job(session, job_id) if wait else _lock_if_free(session, job_id)
+        if locked is None:
+            continue
+        job, stages = locked
         still = set(session.scalars(select(StageRow.id).where(running, StageRow.job_id == job_id)))
         for row in stages:
             if row.id in still:
@@ -330,9 +349,15 @@ def _lose_all(
 
 
 def reap_expired(session: Session, when: datetime | None = None) -> list[str]:
-    """Take back the stages whose leases ran out. Ids that are ready again."""
+    """Take back the stages whose leases ran out. Ids that are ready again.
+
+    Jobs that another has locked wait for the next round. Mostly that is a heartbeat; but a process
+    that was frozen, or cut off, within a transaction holds its rows until the database ends that
+    (`storage.postgres`), and must not keep all other leases from being taken back.
+    """
     when = when or now(session)
-    return _lose_all(session, StageRow.lease_until < when, when, reason="lease_expired")
+    expired = StageRow.lease_until < when
+    return _lose_all(session, expired, when, reason="lease_expired", wait=False)
 
 
 def owner_name(worker_id: str, boot: str) -> str:
@@ -344,4 +369,4 @@ def release_worker(session: Session, worker_id: str, when: datetime | None = Non
     """Free what a worker's former selves held: for one that starts again under its old id."""
     owner = StageRow.lease_owner
     mine = (owner == worker_id) | owner.startswith(worker_id + BOOT_MARK, autoescape=True)
-    return _lose_all(session, mine, when or now(session), reason="worker_restarted")
+    return _lose_all(session, mine, when or now(session), reason="worker_restarted", wait=True)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import psycopg
 from psycopg import sql
 from sqlalchemy import Engine, event
-from sqlalchemy.exc import InvalidatePoolError
+from sqlalchemy.exc import DBAPIError, InvalidatePoolError
 
 Result = TypeVar("Result")
 
@@ -82,6 +82,11 @@ class BoundedConnection(psycopg.Connection[Any]):
             return result
 
 
+def is_locked(error: DBAPIError) -> bool:
+    """Whether the database refused a statement because another has a row locked."""
+    return getattr(error.orig, "sqlstate", None) == "55P03"
+
+
 def bound(engine: Engine, deadline_s: float) -> None:
     """Have all connections of an engine bounded. deadline_s: for one statement, in seconds."""
 
@@ -96,7 +101,9 @@ def bound(engine: Engine, deadline_s: float) -> None:
         for name, seconds in (
             ("statement_timeout", server_s),
             ("lock_timeout", server_s / 2),
-            ("idle_in_transaction_session_timeout", 4 * deadline_s),
+            # Of a client that was cut off, or frozen, between two statements: its rows stay locked
+            # so long. Well below a lease, or the worker whose row it is could not extend it.
+            ("idle_in_transaction_session_timeout", deadline_s),
         ):
             connection.execute(
                 sql.SQL("SET {} = {}").format(sql.Identifier(name), round(1000 * seconds))

@@ -50,22 +50,23 @@ def record_event(
     )
 
 
-def lock_job(session: Session, job_id: str) -> tuple[Job, list[StageRow]]:
+def lock_job(session: Session, job_id: str, *, nowait: bool = False) -> tuple[Job, list[StageRow]]:
     """The job and its stages as they are now, locked until the transaction ends.
 
     Stages before the job: so does a claim, which begins with one stage. Others may still add rows
-    that name the job (events, log lines).
+    that name the job (events, log lines). nowait: with an OperationalError where another has one of
+    them locked (`storage.postgres.is_locked`).
     """
     fresh = {"populate_existing": True}
     stages = session.scalars(
         select(StageRow)
         .where(StageRow.job_id == job_id)
         .order_by(StageRow.seq)
-        .with_for_update(key_share=True),
+        .with_for_update(key_share=True, nowait=nowait),
         execution_options=fresh,
     ).all()
     job = session.scalars(
-        select(Job).where(Job.id == job_id).with_for_update(key_share=True),
+        select(Job).where(Job.id == job_id).with_for_update(key_share=True, nowait=nowait),
         execution_options=fresh,
     ).one_or_none()
     if job is None:

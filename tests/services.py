@@ -138,7 +138,11 @@ def redis_server(tmp_path: Path) -> Iterator[RedisServer]:
 
 class Gate:
     """A TCP port that leads to a real server, and can be made to hang: it then accepts, takes what
-    is sent, and never answers, until it is opened again. Without a server it only ever hangs."""
+    is sent, and never answers, until it is opened again. Without a server it only ever hangs.
+
+    It can also lose the connections that there are, as a network does whose way changed: neither
+    end is told, and new ones work.
+    """
 
     def __init__(self, reach: Callable[[], socket.socket] | None = None) -> None:
         """reach: connects to the server."""
@@ -146,6 +150,8 @@ class Gate:
         self._open = threading.Event()
         self._ended = threading.Event()
         self._sockets: list[socket.socket] = []
+        self._num_accepted = 0
+        self._num_unheard = self._num_unanswered = 0  # of the first so many connections
         self._listener = socket.create_server(("127.0.0.1", 0), backlog=512)
         self.port: int = self._listener.getsockname()[1]
         if reach is not None:
@@ -159,6 +165,12 @@ class Gate:
     def open(self) -> None:
         """Answer again, also what was asked meanwhile."""
         self._open.set()
+
+    def cut_off(self, *, answers_alone: bool = False) -> None:
+        """What the connections that there are carry is lost from now on, each way or one way."""
+        self._num_unanswered = self._num_accepted
+        if not answers_alone:
+            self._num_unheard = self._num_accepted
 
     def close(self) -> None:
         """Drop everything."""
@@ -176,24 +188,30 @@ class Gate:
             except OSError:
                 return
             self._sockets.append(near)
+            number, self._num_accepted = self._num_accepted, self._num_accepted + 1
             if self._reach is not None:
-                threading.Thread(target=self._serve, args=(near,), daemon=True).start()
+                threading.Thread(target=self._serve, args=(near, number), daemon=True).start()
 
-    def _serve(self, near: socket.socket) -> None:
+    def _serve(self, near: socket.socket, number: int) -> None:
         assert self._reach is not None
         self._open.wait()
         with contextlib.suppress(OSError):
             far = self._reach()
             self._sockets.append(far)
-            threading.Thread(target=self._pass_on, args=(near, far), daemon=True).start()
-            self._pass_on(far, near)
+            requests = (near, far, lambda: number < self._num_unheard)
+            threading.Thread(target=self._pass_on, args=requests, daemon=True).start()
+            self._pass_on(far, near, lambda: number < self._num_unanswered)
 
-    def _pass_on(self, source: socket.socket, target: socket.socket) -> None:
+    def _pass_on(
+        self, source: socket.socket, target: socket.socket, is_cut: Callable[[], bool]
+    ) -> None:
         with contextlib.suppress(OSError):
             while data := source.recv(1 << 16):
                 self._open.wait()
-                target.sendall(data)
-            target.shutdown(socket.SHUT_WR)
+                if not is_cut():
+                    target.sendall(data)
+            if not is_cut():
+                target.shutdown(socket.SHUT_WR)
 
 
 @pytest.fixture

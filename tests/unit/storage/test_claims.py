@@ -183,9 +183,9 @@ def test_the_reaper_leaves_a_lease_that_was_extended_while_it_looked(
     assert claim is not None
     found = lock_job
 
-    def beat_first(session: Any, job_id: str) -> Any:
+    def beat_first(session: Any, job_id: str, **how: Any) -> Any:
         heartbeat(session, claim, 60.0, when=seconds(70))
-        return found(session, job_id)
+        return found(session, job_id, **how)
 
     monkeypatch.setattr("storage.leases.lock_job", beat_first)
     with either_database.session_scope() as session:
