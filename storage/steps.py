@@ -21,7 +21,7 @@ STEPS: MappingProxyType[str, tuple[str, ...]] = MappingProxyType(
     {
         # the API
         "hold": _COMMIT,  # an Idempotency-Key is held
-        "capture": (".put",),  # the uploaded bytes are stored, no record names them
+        "capture": (".bytes", ".put"),  # uploaded bytes go to the store; no record names them yet
         "create": _COMMIT,  # a capture, a job, or a job's next generation
         "cancel": _COMMIT,
         "delete": _COMMIT,  # the records of a job or a capture

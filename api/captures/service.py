@@ -84,7 +84,7 @@ def _store_and_record(upload: _Upload) -> Response:
     key = blob_content(upload.tenant_id, upload.received.sha256, new_id())
     folder = key.removesuffix("content")
     try:
-        store.put_file(key, upload.received.path)
+        store.put_file(key, upload.received.path, lambda count: reached("capture.bytes"))
         reached("capture.put")
         done, named = upload.record(brought=key)
     except DBAPIError:

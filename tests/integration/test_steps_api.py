@@ -46,6 +46,7 @@ AUTHORISED = {"Authorization": f"Bearer {KEY}"}
 KILLS = (
     ("upload", "hold.commit"),
     ("upload", "hold.committed"),
+    ("upload", "capture.bytes"),
     ("upload", "capture.put"),
     ("upload", "create.commit"),
     ("upload", "create.committed"),
