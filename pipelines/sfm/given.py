@@ -11,6 +11,7 @@ Nothing here fails a capture: what goes wrong leaves the given poses, and is tol
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -60,7 +61,7 @@ _BASE_S, _PER_IMAGE_S = 300.0, 5.0
 """Seconds after which refinement gives up: many times what it takes on a machine of two cores."""
 
 _UNREFINED = (PipelineError, ArithmeticError, MemoryError, OSError, RuntimeError, ValueError)
-"""What may go wrong in a refinement without harm to the job."""
+"""What may go wrong in a refinement without harm to the job: the log has it in full."""
 
 
 class OutOfTime(Exception):
@@ -109,7 +110,8 @@ class Judge:
     """Judges and refines the given poses of one capture.
 
     settings: of features. progress: receives the share that is done and a message; what it raises
-    ends all. depth_ratio: of refined or given points, see `pipelines.sfm.given_depth`.
+    ends all. logger: receives what breaks off. depth_ratio: of refined or given points, see
+    `pipelines.sfm.given_depth`.
     """
 
     def __init__(
@@ -123,6 +125,7 @@ class Judge:
         upsample: Literal["auto", "on", "off"],
         num_threads: int,
         seed: int,
+        logger: logging.Logger,
     ) -> None:
         self._posed = posed
         self._reconstructor = reconstructor
@@ -132,6 +135,7 @@ class Judge:
         self._upsample = upsample
         self._num_threads = num_threads
         self._seed = seed
+        self._logger = logger
         self._looked: set[int] = set()
 
     def judge(self, mode: Mode, sent: Callable[[Floats], Floats]) -> Judged:
@@ -152,6 +156,7 @@ class Judge:
         except OutOfTime:
             judged = replace(judged, why="refining them would have taken too long")
         except _UNREFINED as error:
+            self._logger.warning("Looking at the given poses broke off.", exc_info=True)
             judged = replace(judged, why=f"looking at them broke off: {_words(error)}")
         return replace(judged, seconds=time.monotonic() - began)
 

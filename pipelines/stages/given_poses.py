@@ -77,6 +77,7 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             upsample=options.upsample,
             num_threads=options.num_threads if options.num_threads > 0 else num_processors(),
             seed=ctx.seed,
+            logger=ctx.logger,
         )
         judged = judge.judge(options.given, lambda poses: as_sent(poses, cameras.notes))
     ctx.logger.info("The given poses are %s: %s", judged.verdict, judged.why)

@@ -241,12 +241,17 @@ def _worse_when_refined() -> Any:
     return lambda found, *_: (1.0, 0.01) if found.before is None else (1.05, 0.01)
 
 
-@pytest.mark.parametrize("broken", [ToolError("no"), ValueError("no"), given.OutOfTime()])
-def test_a_refinement_that_breaks_off_leaves_the_given_poses(
+@pytest.mark.parametrize(
+    ("broken", "is_logged"),
+    [(ToolError("no"), True), (ValueError("no"), True), (given.OutOfTime(), False)],
+)
+def test_a_refinement_that_breaks_off_leaves_the_given_poses_and_its_error_in_the_log(
     tmp_path: Path,
     pictures: list[Image.Image],
     monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
     broken: Exception,
+    is_logged: bool,
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise broken
@@ -256,6 +261,8 @@ def test_a_refinement_that_breaks_off_leaves_the_given_poses(
     summary = run(OPTIONS, ctx)
     assert summary["given"]["verdict"] == "kept"
     assert_as_given(ctx)
+    told = [record.exc_info[1] for record in caplog.records if record.exc_info]
+    assert told == ([broken] if is_logged else [])
 
 
 def test_a_capture_whose_features_cannot_be_found_goes_on(
