@@ -25,7 +25,9 @@ from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.tools.ffmpeg import ffmpeg_executable
 from tests.capture_writers import (
     Floats,
+    Given,
     arkit_pose,
+    exact,
     jpeg,
     landscape_camera,
     named,
@@ -84,19 +86,23 @@ def _projection(lens: Intrinsics) -> list[float]:
     return [float(value) for value in rows.ravel()]
 
 
-def write_scanner_app(path: Path, num: int = 5, width: int = 160, step: int = 3) -> CamerasFile:
+def write_scanner_app(
+    path: Path, num: int = 5, width: int = 160, step: int = 3, given: Given = exact
+) -> CamerasFile:
     """3D Scanner App's "All Data": a picture of every third frame, the rest of every frame.
 
     Intrinsics are for the phone's own size, 1920 wide, and differ between frames; their pixel
-    centres are at integers. num: pictures.
+    centres are at integers. num: pictures. given: what is written in place of the true poses.
     """
     walked = breathing(walk(num * step, landscape_camera(1920), frame_rate=6.0))
+    believed = given(walked)
     pictures: dict[int, str] = {}
     with zipfile.ZipFile(path, "w") as archive:
         for index, image in enumerate(walked.images):
             pose = pose_matrix(image)
             lens = walked.cameras[image.camera]
-            rows = np.vstack([arkit_pose(pose), [0, 0, 0, 1]])
+            as_given = arkit_pose(pose_matrix(believed.images[index]))
+            rows = np.vstack([as_given, [0, 0, 0, 1]])
             k = [lens.fl_x, 0, lens.cx - 0.5, 0, lens.fl_y, lens.cy - 0.5, 0, 0, 1]
             values = {
                 "cameraGrain": 0,

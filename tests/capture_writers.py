@@ -13,6 +13,7 @@ import io
 import json
 import tempfile
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,9 @@ from pipelines.sample.scene import depth_image, pose_matrix
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics
 
 Floats = NDArray[np.float64]
+
+Given = Callable[[CamerasFile], CamerasFile]
+"""What an app believes of the true cameras: the poses that are written."""
 
 ARKIT_FROM_WORLD: Floats = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """ARKit's frame is +Y up; rows [2, 0, 1] of its poses give our world back."""
@@ -70,6 +74,11 @@ def named(truth: CamerasFile, names: dict[int, str]) -> CamerasFile:
         truth,
         images=tuple(replace(truth.images[i], file=name) for i, name in names.items()),
     )
+
+
+def exact(truth: CamerasFile) -> CamerasFile:
+    """The true cameras themselves."""
+    return truth
 
 
 def arkit_pose(pose: Floats) -> Floats:
@@ -125,16 +134,18 @@ def quaternion(rotation: Floats) -> list[float]:
 
 
 def write_polycam(
-    path: Path, num: int = 24, width: int = 640, corrected: bool = True
+    path: Path, num: int = 24, width: int = 640, corrected: bool = True, given: Given = exact
 ) -> CamerasFile:
     """A Polycam raw export: `keyframes/` with pictures, camera files, depth and confidence.
 
     Names are microseconds. With `corrected`, `corrected_cameras/` holds the true poses and
     `cameras/` drifted ones, as ARKit's are. The picture of keyframe 2 and the camera file of
-    keyframe 4 are missing, as happens in real exports; only the others are in the truth.
+    keyframe 4 are missing, as happens in real exports; only the others are in the truth. given:
+    what is written in place of the true poses, where nothing was corrected.
     """
     camera = landscape_camera(width)
     truth = walk(num, camera, frame_rate=10.0)
+    believed = given(truth)
     pictures = render_all(truth)
     kind = "corrected_" if corrected else ""
     names: dict[int, str] = {}
@@ -152,7 +163,8 @@ def write_polycam(
             if index != 4:
                 drifted = pose.copy()
                 drifted[:, 3] += 0.15 * index / num * np.array([1.0, -0.5, 0.3])
-                first = _polycam_camera(camera, drifted if corrected else pose, index)
+                as_given = pose_matrix(believed.images[index])
+                first = _polycam_camera(camera, drifted if corrected else as_given, index)
                 archive.writestr(f"keyframes/cameras/{stem}.json", first)
                 if corrected:
                     archive.writestr(
@@ -197,11 +209,13 @@ def write_record3d(
     missing: int = 5,
     folder: str = "EXR_RGBD/",
     depth: bool = False,
+    given: Given = exact,
 ) -> CamerasFile:
     """A Record3D "EXR + JPG" export: `rgb/<n>.jpg`, `metadata.json`, and `depth/<n>.exr` if wanted.
 
     K is column-major, poses are [qx, qy, qz, qw, tx, ty, tz] in ARKit's frame, upright pictures.
     The picture of frame `missing` is not there, but its pose is: number n belongs to `poses[n]`.
+    given: what is written in place of the true poses.
     """
     height, width = long_side_px, long_side_px * 3 // 4
     focal = 0.73 * height
@@ -210,11 +224,12 @@ def write_record3d(
     )
     rate = 60.0
     truth = walk(num, camera, frame_rate=rate)
+    believed = given(truth)
     names: dict[int, str] = {}
     poses: list[list[float]] = []
     with zipfile.ZipFile(path, "w") as archive:
         for index, picture in enumerate(render_all(truth)):
-            pose = arkit_pose(pose_matrix(truth.images[index]))
+            pose = arkit_pose(pose_matrix(believed.images[index]))
             poses.append([*quaternion(pose[:, :3]), *(float(value) for value in pose[:, 3])])
             if index != missing:
                 names[index] = f"{folder}rgb/{index}.jpg"

@@ -107,18 +107,18 @@ def walked(
     return CamerasFile((camera,), images, metric=True, source="sample")
 
 
-def pictures(truth: CamerasFile, side: int = 2) -> Iterator[Picture]:
+def pictures(truth: CamerasFile, side: int = 2, scene: Scene = SAMPLE) -> Iterator[Picture]:
     """All pictures of a walk in order; two are worked on at a time."""
 
     def one(image: PosedImage) -> Picture:
         pose = np.array(image.world_from_camera)
-        return picture_of(truth.cameras[image.camera], pose, side=side)
+        return picture_of(truth.cameras[image.camera], pose, scene, side)
 
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(one, truth.images)
 
 
-def film(path: Path, truth: CamerasFile, side: int = 2) -> Path:
+def film(path: Path, truth: CamerasFile, side: int = 2, scene: Scene = SAMPLE) -> Path:
     """An H.264 film of a walk, upright, frame i being image i."""
     camera = truth.cameras[0]
     process = subprocess.Popen(
@@ -133,7 +133,7 @@ def film(path: Path, truth: CamerasFile, side: int = 2) -> Path:
         stdin=subprocess.PIPE,
     )  # fmt: skip
     assert process.stdin is not None
-    for picture in pictures(truth, side):
+    for picture in pictures(truth, side, scene):
         process.stdin.write(picture.tobytes())
     process.stdin.close()
     assert process.wait() == 0

@@ -43,9 +43,9 @@ def write_posed_capture(path: Path, take: Take, num_frames: int, long_side_px: i
         for index, picture in enumerate(render_all(truth, take=take)):
             image = truth.images[index]
             depth = depth_image(camera, pose_matrix(image), take.scene) / DEPTH_UNIT_M
-            archive.writestr(f"images/{index:05d}.jpg", _encoded(picture, "JPEG"))
+            archive.writestr(f"images/{index:05d}.jpg", encoded(picture, "JPEG"))
             archive.writestr(
-                f"depth/{index:05d}.png", _encoded(np.rint(depth).astype(np.uint16), "PNG")
+                f"depth/{index:05d}.png", encoded(np.rint(depth).astype(np.uint16), "PNG")
             )
             pose = np.vstack([pose_matrix(image), [0.0, 0.0, 0.0, 1.0]])
             frames.append(
@@ -69,7 +69,8 @@ def write_posed_capture(path: Path, take: Take, num_frames: int, long_side_px: i
         archive.writestr("transforms.json", json.dumps(transforms))
 
 
-def _encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], kind: str) -> bytes:
+def encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], kind: str) -> bytes:
+    """A picture as a file: JPEG at 95, or PNG."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, kind, **({"quality": 95} if kind == "JPEG" else {}))
     return buffer.getvalue()

@@ -24,6 +24,8 @@ OF_THE_WHOLE_PRODUCT = (
     "job_overhead.py",
     "long_film.py",
     "mesh_memory.py",
+    "pose_accuracy.py",
+    "pose_captures.py",
     "poses_speed.py",
     "poses_ways.py",
     "scene_capture.py",
