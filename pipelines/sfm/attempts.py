@@ -31,7 +31,7 @@ from pipelines.sfm.retrieval import (
 )
 from pipelines.sfm.rungs import MAX_ALL_PAIRS, RUNGS, Matches, Rung, Standing
 from pipelines.sfm.source import Source, camera_groups
-from pipelines.sfm.turning import is_turning
+from pipelines.sfm.turning import focal_of_turning, is_turning
 from pipelines.sfm.wide_lenses import probing_pairs, recognised
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import (
@@ -196,6 +196,7 @@ class Ladder:
             self._statistics = self._reconstructor.statistics()
             if not self._attempts and is_turning(self._statistics):
                 break
+            self._start_focals()
             self._map(rung, matcher, (matched, end))
         return self.outcome
 
@@ -310,6 +311,24 @@ class Ladder:
         watch = self._progress.watch(span, len(pairs), "matching pair")
         self._reconstructor.match(pairs, watch, thorough=wanted.thorough)
         self._checkpoint.save(step)
+
+    def _start_focals(self) -> None:
+        """Give mapping a focal length to start from, where matches tell one and nothing else does.
+
+        From COLMAP's own start, 1.2 long sides, a room that is filmed from its middle falls to
+        pieces: each turn is taken for a smaller one.
+        """
+        found = focal_of_turning(self._statistics)
+        if found is None:
+            return
+        all_images = range(len(self._source.files))
+        num_cameras = self._reconstructor.start_focal(all_images, found)
+        self._ctx.logger.info(
+            "homographies of %d pairs: a focal length of %.2f long sides, for %d cameras",
+            len(self._statistics.homographies),
+            found,
+            num_cameras,
+        )
 
     def _map(self, rung: Rung, matcher: str, span: Span) -> None:
         began = time.monotonic()

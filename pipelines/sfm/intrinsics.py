@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -169,7 +169,7 @@ def settle_lenses(
     best = _best_fit(fits, trials)
     lenses = best.lenses
     if lenses != trials.cameras:
-        model = trials.adopt(lenses)
+        model = replace(trials.adopt(lenses), agreement=model.agreement)
     moved = [trials.fit(lenses, start=best, focal_scale=1.0 + step) for step in (-_STEP, _STEP)]
     written = dict(zip(sorted(trials.cameras), model.cameras, strict=True))
     found = [

@@ -18,7 +18,7 @@ Ponce, "Accurate camera calibration from multi-view stereo and bundle adjustment
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,9 @@ MIN_FOUND = 0.3
 _PORTION = 20_000
 """Alignments between two reports."""
 _ENDS = Rounds(iterations=20, rounds=6, tolerance=1e-7)
+_ENDS_AS_MAPPED = Rounds(iterations=20, rounds=3, tolerance=1e-5)
+"""Mapping stops when observations hardly change, some way before poses do; less than this does not
+show in them."""
 
 
 @dataclass(frozen=True)
@@ -87,26 +90,27 @@ def refine_model(
     report: Report,
     num_threads: int,
 ) -> tuple[SparseModel, Refinement | None]:
-    """The model with its keypoints refined, and what was changed; as it is, and None, where that is
-    not wanted, or not possible.
+    """The model with its keypoints refined, and what was changed; where that is not wanted, or not
+    possible, adjusted to the end with the keypoints it has, and None.
 
-    Panoramas stay as they were mapped: what a patch of theirs looks like from elsewhere is no
-    affine map. report: called while poses are adjusted, too.
+    Panoramas' keypoints stay: what a patch of theirs looks like from elsewhere is no affine map.
+    report: called while poses are adjusted, too.
     """
-    if not options.subpixel or source.has_panoramas:
-        return model, None
     tracks = reconstructor.stored_tracks(model, lambda: report(1.0))
-    refinement = refine_keypoints(
-        tracks,
-        {image_id: source.paths[index] for image_id, index in tracks.indices.items()},
-        report,
-        long_side_px=options.max_image_px,
-        num_threads=num_threads,
-        refine_principal_point=options.refine_principal_point,
-    )
-    if refinement is None:
-        return model, None
-    return tracks.write(reconstructor.scratch / "refined"), refinement
+    refined = None
+    if options.subpixel and not source.has_panoramas:
+        refined = refine_keypoints(
+            tracks,
+            {image_id: source.paths[index] for image_id, index in tracks.indices.items()},
+            report,
+            long_side_px=options.max_image_px,
+            num_threads=num_threads,
+            refine_principal_point=options.refine_principal_point,
+        )
+    if refined is None:
+        tracks.adjust(_ENDS_AS_MAPPED, refine_principal_point=options.refine_principal_point)
+    written = tracks.write(reconstructor.scratch / "refined")
+    return replace(written, agreement=model.agreement), refined
 
 
 def refine_keypoints(

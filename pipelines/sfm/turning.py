@@ -1,9 +1,13 @@
-"""Did the camera travel, or only turn? From the homographies between its pictures.
+"""Did the camera travel, or only turn, and through which lens? From homographies between pictures.
 
 A camera that turns on the spot sees pictures related by H ~ K R K^-1, with one K for all. So does
 nothing else: a camera that travels past one plane gives H ~ K (R + t n^T / d) K^-1. COLMAP puts
 both into one class of pairs, and reconstructs a turning camera with a wrong focal length and small
-reprojection errors, so errors do not tell. Source: Hartley and Zisserman, "Multiple View
+reprojection errors, so errors do not tell.
+
+One that turns much and travels little, as in a room that is filmed from its middle, is nearly the
+former: its homographies tell the focal length to a tenth, which the fundamental matrices of its
+few other pairs do not. Source: Hartley and Zisserman, "Multiple View
 Geometry", 2nd edition, 8.4 and 13.1.
 """
 
@@ -27,6 +31,19 @@ _MAX_RESIDUAL = 0.01
 0.007, of 4 % 0.03; travelling along one wall 0.04."""
 
 
+_MIN_PAIRS = 10
+_MIN_TURN_DEG = 3.0
+"""A pair that turned less says nothing of the focal length."""
+_MOST_SCATTERED = 0.25
+"""How far apart the quartiles of the pairs' own focal lengths may lie, as a share of the median.
+Measured: 0.09 of the room that is filmed from its middle."""
+_MOST_TRAVELLED = 0.06
+"""Residual beyond which pairs differ by more than turning: 0.04 of that room."""
+_MIN_GAIN = 2.0
+"""How many times less the residual must be than with COLMAP's own focal length to start from."""
+_COLMAP_FOCAL = 1.2
+
+
 def is_turning(statistics: PairStatistics) -> bool:
     """Whether the camera turned in place, or stood still, instead of travelling.
 
@@ -46,11 +63,38 @@ def turning_residual(homographies: Array) -> float:
     Returns the median over pairs of the root mean square distance between where H and the nearest
     K R K^-1 send a grid of points, in units of the long side, for the best common focal length.
     """
+    return float(np.median(_residuals(homographies)[0], axis=1).min())
+
+
+def focal_of_turning(statistics: PairStatistics) -> float | None:
+    """The focal length, in units of the long side, of a camera whose pairs mostly differ as they do
+    by turning; None where too few do, or where they do not agree on one.
+
+    It is the median of what each pair says by itself: travelling makes each a little wrong.
+    """
+    if len(statistics.homographies) < max(_MIN_PAIRS, 0.5 * statistics.num_verified):
+        return None
+    residuals, angles = _residuals(statistics.homographies)
+    best = residuals.argmin(axis=0)
+    turned = np.take_along_axis(angles, best[None], axis=0)[0] >= np.radians(_MIN_TURN_DEG)
+    if turned.sum() < max(_MIN_PAIRS, 0.5 * statistics.num_verified):
+        return None
+    low, middle, high = np.percentile(_FOCALS[best[turned]], (25, 50, 75))
+    misses = np.median(residuals[:, turned], axis=1)
+    there, usual = (misses[np.abs(_FOCALS - at).argmin()] for at in (middle, _COLMAP_FOCAL))
+    agree = high - low <= _MOST_SCATTERED * middle
+    fits = there <= _MOST_TRAVELLED and _MIN_GAIN * there <= usual
+    return float(middle) if agree and fits else None
+
+
+def _residuals(homographies: Array) -> tuple[Array, Array]:
+    """For each of _FOCALS and each homography [H, 3, 3], [F, H]: how far the nearest K R K^-1 sends
+    a grid of points from where the homography does, root mean square, and the angle of R."""
     signs = np.sign(np.linalg.det(homographies))
     scaled = homographies * (signs / np.cbrt(np.abs(np.linalg.det(homographies))))[:, None, None]
     points = np.concatenate([_GRID.reshape(-1, 2), np.ones((_GRID.size // 2, 1))], axis=1)
     wanted = _project(scaled, points)
-    best = np.inf
+    residuals, angles = [], []
     for focal in _FOCALS:
         calibration = np.diag([focal, focal, 1.0])
         turned = np.linalg.inv(calibration) @ scaled @ calibration
@@ -58,9 +102,10 @@ def turning_residual(homographies: Array) -> float:
         rotation = left @ right
         rotation *= np.sign(np.linalg.det(rotation))[:, None, None]
         found = _project(calibration @ rotation @ np.linalg.inv(calibration), points)
-        per_pair = np.sqrt(((found - wanted) ** 2).sum(axis=2).mean(axis=1))
-        best = min(best, float(np.median(per_pair)))
-    return best
+        residuals.append(np.sqrt(((found - wanted) ** 2).sum(axis=2).mean(axis=1)))
+        cosines = (np.trace(rotation, axis1=1, axis2=2) - 1.0) / 2.0
+        angles.append(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return np.array(residuals), np.array(angles)
 
 
 def _project(homographies: Array, points: Array) -> Array:

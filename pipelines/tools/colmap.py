@@ -33,7 +33,7 @@ from PIL import Image
 from pipelines.errors import ToolError
 from pipelines.tools.colmap_adjustment import Run
 from pipelines.tools.colmap_lenses import LensTrials
-from pipelines.tools.colmap_probing import MatchedPairs, set_lens
+from pipelines.tools.colmap_probing import MatchedPairs, set_lens, start_focal
 from pipelines.tools.colmap_results import (
     Correspondences,
     PairStatistics,
@@ -311,6 +311,11 @@ class Reconstructor:
         Their pairs must be matched again, which only verifies what was matched before.
         """
         set_lens(self.database, self.names, indices, lens, focal_px)
+
+    def start_focal(self, indices: Sequence[int], long_sides: float) -> int:
+        """Let `map` start from a focal length where none is known, see `colmap_probing`. Not while
+        a call runs."""
+        return start_focal(self.database, self.names, indices, long_sides)
 
     def stored_tracks(self, model: SparseModel, poll: Callable[[], None]) -> StoredTracks:
         """The tracks of a model that `map` found. poll: what it raises ends an adjustment."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from pipelines.tools.colmap import (
     CameraGroup,
@@ -73,3 +74,22 @@ def test_features_are_read_evenly_and_no_more_than_wanted(tmp_path: Path) -> Non
     assert [part.shape for part in some] == [(20, 128)] * 3
     np.testing.assert_array_equal(some[1][0], whole[1][0])
     np.testing.assert_array_equal(some[1][-1], whole[1][-1])
+
+
+def test_mapping_starts_from_a_focal_length_where_none_is_known(tmp_path: Path) -> None:
+    reconstructor = Reconstructor(tmp_path / "colmap.db", three_pictures(tmp_path), tmp_path / "s")
+    known = CameraGroup((0,), "PINHOLE", 300.0)
+    reconstructor.extract((known, CameraGroup((1, 2), "SIMPLE_RADIAL")), COARSE, nothing)
+    reconstructor.match([(0, 1), (1, 2)], nothing)
+    before = reconstructor.verified(10, 1000)
+    assert reconstructor.start_focal([0, 1, 2], 0.7) == 1
+    with pycolmap.Database.open(tmp_path / "colmap.db") as opened:
+        lenses = {camera.model.name: camera for camera in opened.read_all_cameras()}
+    assert lenses["PINHOLE"].params.tolist() == [300.0, 300.0, 200.0, 150.0]
+    assert lenses["SIMPLE_RADIAL"].params.tolist() == [280.0, 200.0, 150.0, 0.0]
+    assert lenses["SIMPLE_RADIAL"].has_prior_focal_length
+    after = reconstructor.verified(10, 1000)
+    assert {pair: len(places[0]) for pair, places in after.items()} == {
+        pair: len(places[0]) for pair, places in before.items()
+    }
+    assert reconstructor.start_focal([0, 1, 2], 0.9) == 0
