@@ -20,6 +20,10 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
+_MOST_PX, _LEAST_DEG = 4.0, 1.5
+"""How far an observation may miss its point, and from how different directions a point must be
+seen: what mapping itself demands by default."""
+
 
 @dataclass(frozen=True)
 class TrackPairs:
@@ -140,7 +144,9 @@ class StoredTracks:
                 )
 
     def adjust(self, ends: Rounds, *, refine_principal_point: bool) -> None:
-        """Adjust poses, points and lenses to the observations as they are now."""
+        """Adjust poses, points and lenses to the observations as they are now, and leave out what
+        then fits none of them: of a fisheye, what left the angles that its lens is made for may be
+        any number of pixels off."""
         adjust(
             self._model,
             ends,
@@ -149,6 +155,7 @@ class StoredTracks:
             num_threads=self._num_threads,
             refine_principal_point=refine_principal_point,
         )
+        pycolmap.ObservationManager(self._model).filter_all_points3D(_MOST_PX, _LEAST_DEG)
         self._model.update_point_3d_errors()
 
     def write(self, folder: Path) -> SparseModel:

@@ -128,6 +128,20 @@ def test_poses_and_points_come_nearer_to_the_truth(scene: Scene, tmp_path: Path)
     assert pycolmap.Reconstruction(folder).image(wrong[0]).points2D[wrong[1]].has_point3D()
 
 
+def test_an_observation_that_fits_nothing_is_left_out_of_an_adjusted_model(
+    scene: Scene, tmp_path: Path
+) -> None:
+    tracks, wrong = opened(scene), scene[2]
+    before = tracks.error_px
+    tracks.adjust(subpixel._ENDS_AS_MAPPED, refine_principal_point=False)
+    assert tracks.write(tmp_path / "adjusted").error_px == tracks.error_px < before
+    model = pycolmap.Reconstruction(tmp_path / "adjusted")
+    assert not model.image(wrong[0]).points2D[wrong[1]].has_point3D()
+    assert model.compute_num_observations() > 0.98 * (
+        pycolmap.Reconstruction(scene[0]).compute_num_observations()
+    )
+
+
 def test_memory_for_few_pictures_gives_the_same(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

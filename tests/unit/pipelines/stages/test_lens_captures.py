@@ -100,6 +100,7 @@ def test_a_fisheyes_film_is_recognised_and_its_lens_found(tmp_path: Path) -> Non
     found = run(tmp_path / "job", "poses", PosesOptions(max_image_px=480, num_features=1500))
     assert found["num_registered"] == found["num_images"] == 14
     assert found["intrinsics"]["model"] == "OPENCV_FISHEYE"
+    assert found["mean_reprojection_error_px"] < 1.0
     assert "fisheye" in found["intrinsics"]["why"]
     cameras = CamerasFile.load(tmp_path / "job" / "poses" / "cameras.json")
     (lens,) = cameras.cameras
