@@ -10,12 +10,13 @@ BODY = ("bad_request", "request_timeout", "too_large")
 """Of a call with a JSON body."""
 ONCE = ("idempotency_key_running", "idempotency_key_reused")
 """Of a call that takes an Idempotency-Key."""
-COMMON = ("unauthorized", "request_invalid", "internal_error", "database_unavailable")
+COMMON = (
+    *("unauthorized", "request_invalid", "internal_error", "database_unavailable", "disk_full"),
+)
 """Of every call."""
 UPLOAD = (
     *("file_missing", "file_repeated", "multipart_malformed", "unsupported_type", "too_large"),
-    *("upload_stalled", "upload_truncated", "uploads_busy", "disk_full"),
-    *("object_store_unavailable",),
+    *("upload_stalled", "upload_truncated", "uploads_busy", "object_store_unavailable"),
 )
 """Of an upload, as a transfer."""
 CAPTURE = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from sqlalchemy.exc import OperationalError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -23,6 +25,7 @@ from storage.db import Database
 from storage.deletions import Drainer
 from storage.objects import ObjectStore
 
+logger = logging.getLogger("nerfworks.api")
 MAX_KEY_CHARS = 256
 MAX_STORE_CALLS = 8
 STORE_TURN_S = 1.0
@@ -133,8 +136,11 @@ def require_key(
         raise UnauthorizedError("The API key is not valid.")
     caller, due = Caller(found[0].id, found[0].tenant_id), is_use_due(*found)
     if due:
-        with services.database.session_scope() as session:
-            touch_api_key(session, caller.id)
+        try:
+            with services.database.session_scope() as session:
+                touch_api_key(session, caller.id)
+        except OperationalError as error:  # a full disk; who only reads need not fail for a note
+            logger.warning("the use of a key could not be noted: %s", error.orig)
     return caller
 
 

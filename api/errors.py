@@ -19,7 +19,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from sqlalchemy.exc import DataError, InterfaceError, OperationalError
+from sqlalchemy.exc import DataError, DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
@@ -41,6 +41,7 @@ from api.problems import (
 )
 from pipelines.errors import CaptureError, PipelineError, ResourceError
 from pipelines.options import OptionsError
+from storage.db import is_full
 from storage.errors import (
     ConflictError,
     IdempotencyReusedError,
@@ -228,6 +229,8 @@ def to_api_error(error: Exception) -> ApiError:
         return _of_framework(error)
     if isinstance(error, StorageError):
         return _of_storage(error)
+    if isinstance(error, DBAPIError) and is_full(error):
+        return NoSpaceError("The database has no room left.")
     if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError):
         return UnavailableError("The database does not answer.", code="database_unavailable")
     if isinstance(error, DataError | UnicodeEncodeError):

@@ -38,7 +38,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.engine import Connection
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
 from storage.postgres import bound
@@ -150,6 +150,13 @@ def first_and_now(session: Session, query: Select[Any]) -> tuple[Any, datetime] 
     moment = func.clock_timestamp(type_=UtcDateTime())
     both = session.execute(query.add_columns(moment).limit(1)).first()
     return None if both is None else (both[0], both[1])
+
+
+def is_full(error: DBAPIError) -> bool:
+    """Whether a statement was refused because the disk of the database is full."""
+    if isinstance(error.orig, sqlite3.Error):
+        return getattr(error.orig, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_FULL
+    return getattr(error.orig, "sqlstate", None) == "53100"
 
 
 def name_actor(session: Session, actor: str) -> None:

@@ -70,8 +70,8 @@ from worker.transfer import (
     fetch_capture,
     fetch_inputs,
     missing_bytes,
+    publish_folder,
     restore_checkpoint,
-    upload_folder,
     write_job_file,
 )
 
@@ -228,13 +228,13 @@ class Runner:
             uploader.close(finish=finish, timeout_s=limit_s)
         reached("run.done")
         folder = workspace.stage(stage.name)
-        upload_folder(
+        publish_folder(
             self._store,
             folder,
             prefix,
             guard,
+            lambda: keeper.report(1.0, "the object store is full: waiting for room", None),
             workers=workers,
-            step="publish",
             expected=manifest["files"],
         )
         laps.end("store_s")

@@ -9,6 +9,7 @@ import json
 import secrets
 import shutil
 import stat
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 from pipelines.manifest import file_sha256
 from pipelines.workspace import MANIFEST, Workspace
-from storage.errors import ObjectStoreError
+from storage.errors import ObjectStoreError, ObjectStoreFullError
 from storage.objects import ObjectStore
 from storage.queries import StageInput, StageWork
 from storage.steps import reached
@@ -24,6 +25,8 @@ from worker.locks import folder_lock
 
 Guard = Callable[[], None]
 FETCH_LOCK_S = 3600.0
+ROOM_WAIT_S = 1800.0
+ROOM_STEP_S = 10.0
 
 
 def _run_all(jobs: Iterable[Callable[[], None]], workers: int) -> None:
@@ -81,6 +84,37 @@ def upload_folder(
     if MANIFEST in names:
         put(MANIFEST)()
     reached(f"{step}.stored")
+
+
+def publish_folder(
+    store: ObjectStore,
+    folder: Path,
+    prefix: str,
+    guard: Guard,
+    on_full: Guard,
+    *,
+    workers: int,
+    expected: Sequence[Mapping[str, Any]],
+) -> None:
+    """`upload_folder` of what a stage has made, which may be hours of work: where the store has no
+    room it waits for some, up to ROOM_WAIT_S.
+
+    on_full: called before each wait. Raises ObjectStoreFullError in the end.
+    """
+    give_up_at = time.monotonic() + ROOM_WAIT_S
+    while True:
+        try:
+            return upload_folder(
+                store, folder, prefix, guard, workers=workers, step="publish", expected=expected
+            )
+        except ObjectStoreFullError:
+            if time.monotonic() > give_up_at:
+                raise
+        on_full()
+        again_at = time.monotonic() + ROOM_STEP_S
+        while time.monotonic() < again_at:
+            guard()
+            time.sleep(0.2)
 
 
 def download_folder(
