@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=8,
+        version=9,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",
@@ -76,7 +76,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="check",
-        version=2,
+        version=3,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.check:run",

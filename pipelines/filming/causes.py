@@ -16,6 +16,7 @@ Cause = Literal[
     "blurred",
     "too_few_features",
     "broken_apart",
+    "clip_apart",
     "no_overlap",
     "does_not_fit",
 ]
@@ -25,6 +26,9 @@ FAST = 0.35
 nothing of a view is left."""
 _STREAKED = 1.5
 """Blur that goes one way by this much comes from motion, where no speed could be measured."""
+
+_OF_A_CLIP = ("broken_apart", "no_overlap", "does_not_fit")
+"""What is so of each frame of a clip that shows nothing of the others."""
 
 Span = tuple[int, int]
 """The first and the last of neighbouring pictures."""
@@ -63,6 +67,10 @@ def causes_of(take: Take) -> list[Cause | None]:
     if code == "no_parallax":
         return [None] * len(take.shots)
     found = [cause_of(shot, is_film=take.is_film) for shot in take.shots]
+    for index, cause in enumerate(found):
+        clip = take.clip_of(index)
+        if clip is not None and clip.is_apart and cause in _OF_A_CLIP:
+            found[index] = "clip_apart"
     if code == "no_features":
         early = ("moved_too_fast", "blurred", "too_few_features")
         return [
@@ -72,11 +80,13 @@ def causes_of(take: Take) -> list[Cause | None]:
     return found
 
 
-def spans(indices: Iterable[int]) -> list[Span]:
-    """Runs of neighbouring pictures; one picture between two of them does not part them."""
+def spans(take: Take, indices: Iterable[int]) -> list[Span]:
+    """Runs of neighbouring pictures; one picture between two of them does not part them, the end
+    of a clip does."""
     found: list[Span] = []
     for index in sorted(indices):
-        if found and index - found[-1][1] <= 2:
+        beside = found and index - found[-1][1] <= 2
+        if beside and take.shots[index].clip == take.shots[found[-1][1]].clip:
             found[-1] = (found[-1][0], index)
         else:
             found.append((index, index))

@@ -118,15 +118,26 @@ def noun(take: Take, number: int = 2) -> str:
 
 
 def where(take: Take, found: Iterable[Span]) -> str:
-    """Times of a film ("from 0:12 to 0:19 and at 0:31"), or names of photos."""
-    places = [_where_one(take, span) for span in found]
+    """Times of a film ("from 0:12 to 0:19 and at 0:31"), or names of photos.
+
+    Of several clips the clip's own times: "in clip 2 (b.mp4) from 0:12 to 0:19 and at 0:31".
+    """
+    places, number = [], None
+    for span in found:
+        place, clip = _where_one(take, span), take.clip_of(span[0])
+        if clip is not None and take.shots[span[0]].clip != number:
+            number = take.shots[span[0]].clip
+            place = f"in clip {number + 1} ({clip.name}) {place}"
+        places.append(place)
     return joined(places, more="other places" if take.is_film else "others")
 
 
 def _where_one(take: Take, span: Span) -> str:
     first, last = (take.shots[index] for index in span)
     if first.time_s is not None and last.time_s is not None:
-        start, end = clock(first.time_s), clock(last.time_s)
+        clip = take.clip_of(span[0])
+        offset_s = 0.0 if clip is None else clip.offset_s
+        start, end = clock(first.time_s - offset_s), clock(last.time_s - offset_s)
         return f"at {start}" if start == end else f"from {start} to {end}"
     names = [shot.name or shot.file for shot in take.shots[span[0] : span[1] + 1]]
     return listed(names)
@@ -174,6 +185,12 @@ _LOST: dict[Cause, tuple[str, str]] = {
         "pose in common",
         "Film on without a break between the parts, or go back over a place that both show.",
     ),
+    "clip_apart": (
+        "{where} the pictures show nothing that another clip shows too, {shared}; {count} no pose "
+        "in common",
+        "Let clips overlap: begin each one at a view that another one shows, and move on from "
+        "there; send what shows another place as a capture of its own.",
+    ),
     "no_overlap": (
         "{where} the pictures share too little with the rest, {matches} details at most, and "
         "{count} no pose",
@@ -200,13 +217,14 @@ def _lost(take: Take) -> list[Finding]:
         )
         measured = _measured(take, indices)
         values = {
-            "where": ("" if take.is_film else "in ") + where(take, spans(indices)),
+            "where": ("" if take.is_film else "in ") + where(take, spans(take, indices)),
             "count": f"{len(indices)} of {len(take.shots)} {noun(take)} "
             + ("has" if len(indices) == 1 else "have"),
             "speed": f"{measured.get('max_speed', 0.0):.1f}",
             "blur": f"{measured.get('median_blur_px', 0.0):.0f}",
             "features": f"{measured.get('median_features', 0):.0f}",
             "matches": f"{measured.get('most_matches', 0)}",
+            "shared": _shared(take, indices),
             "that": "that part" if take.is_film else "those",
         }
         if cause == "moved_too_fast" and "max_speed" not in measured:
@@ -215,9 +233,18 @@ def _lost(take: Take) -> list[Finding]:
         text = _capital(what.format(**values)) + "."
         code = str(cause)
         found.append(
-            Finding(code, severity, text, advice.format(**values), tuple(spans(indices)), measured)
+            Finding(
+                code, severity, text, advice.format(**values), tuple(spans(take, indices)), measured
+            )
         )
     return found
+
+
+def _shared(take: Take, indices: list[int]) -> str:
+    """What a picture of those clips shares with one of another clip, at most."""
+    clips = [take.clip_of(index) for index in indices]
+    most = max((clip.most_shared or 0 for clip in clips if clip is not None), default=0)
+    return f"{most} details at most" if most else "not one detail"
 
 
 def _measured(take: Take, indices: list[int]) -> dict[str, Any]:
@@ -267,7 +294,7 @@ def _smeared(take: Take) -> list[Finding]:
     )
     fast = take.is_film and sum(is_fast(take.shots[i]) for i in indices) >= len(indices) / 2
     measured = _measured(take, indices)
-    places = where(take, spans(indices))
+    places = where(take, spans(take, indices))
     what = (
         f"{len(indices)} of {len(take.shots)} {noun(take)} {'is' if len(indices) == 1 else 'are'} "
         f"blurred over about {measured['median_blur_px']:.0f} of 640 pixels ({places})."
@@ -280,7 +307,7 @@ def _smeared(take: Take) -> list[Finding]:
             severity,
             what,
             slower if fast else lighter,
-            tuple(spans(indices)),
+            tuple(spans(take, indices)),
             measured,
         )
     ]

@@ -39,6 +39,7 @@ _CAUSES = {
     "blurred": "blurred",
     "too_few_features": "too little to see",
     "broken_apart": "apart from the rest",
+    "clip_apart": "apart from the other clips",
     "no_overlap": "no overlap with the rest",
     "does_not_fit": "fits nowhere",
 }
@@ -71,6 +72,9 @@ svg{display:block;width:100%}
 .chart{height:74px;background:#f8fafb;border:1px solid #e1e6eb;border-radius:6px}
 .ribbon{height:14px;border-radius:4px;margin-top:6px}
 .axis{display:flex;justify-content:space-between;font-size:.8rem;color:#5b6875;margin-top:4px}
+.clips{justify-content:flex-start}
+.clips span{overflow:hidden;text-overflow:ellipsis;white-space:nowrap;border-left:2px solid #5b6875;
+padding-left:4px}
 .strip{display:grid;grid-template-columns:repeat(auto-fill,minmax(92px,1fr));gap:8px}
 figure{margin:0}
 figure img{width:100%;display:block;border-radius:6px;border:3px solid #1f9d61}
@@ -100,6 +104,7 @@ def build_page(take: Take, report: dict[str, Any], paths: Sequence[Path], num_pi
         _head(take, report, title),
         _advice(report),
         _numbers(take, report, around),
+        _clips(report),
         _timeline(take),
         _space(take, around),
         _strip(take, paths, num_pictures),
@@ -170,6 +175,37 @@ def _numbers(take: Take, report: dict[str, Any], around: Around | None) -> str:
     return f'<section class="card"><h2>In numbers</h2><div class="tiles">{shown}</div></section>'
 
 
+def _clips(report: dict[str, Any]) -> str:
+    """A line for each of several clips."""
+    if not report["clips"]:
+        return ""
+    words = {True: "does not join the others", False: "joined", None: ""}
+    lines = "".join(
+        f'<div class="name"><span><b>{number}</b> {escape(clip["name"])}</span>'
+        f'<span class="muted">{clock(clip["length_s"])} min, {_placed_of(clip)}'
+        f"{words[clip['is_apart']]}</span></div>"
+        for number, clip in enumerate(report["clips"], start=1)
+    )
+    return f'<section class="card"><h2>Clips</h2><div class="row">{lines}</div></section>'
+
+
+def _placed_of(clip: dict[str, Any]) -> str:
+    if clip["num_placed"] is None:
+        return f"{clip['num']} frames"
+    comma = "" if clip["is_apart"] is None else ", "
+    return f"{clip['num_placed']} of {clip['num']} frames with a pose{comma}"
+
+
+def _moment(take: Take, index: int) -> str:
+    """What a picture is called under it: its time, in its own clip, or its name."""
+    shot, clip = take.shots[index], take.clip_of(index)
+    if shot.time_s is None:
+        return shot.name or shot.file
+    if clip is None:
+        return clock(shot.time_s)
+    return f"clip {shot.clip + 1}, {clock(shot.time_s - clip.offset_s)}"
+
+
 def _places(take: Take) -> list[float]:
     """Where each picture stands on the line, in [0, 1]."""
     num = len(take.shots)
@@ -235,6 +271,8 @@ def _stops(values: Sequence[float | None]) -> Curve:
 
 
 def _axis(take: Take) -> str:
+    if take.clips:
+        return _clip_axis(take)
     first, last = take.shots[0], take.shots[-1]
     middle = take.shots[len(take.shots) // 2]
     if take.is_film and first.time_s is not None and last.time_s is not None:
@@ -246,6 +284,21 @@ def _axis(take: Take) -> str:
     else:
         marks = [shot.name or shot.file for shot in (first, middle, last)]
     return '<div class="axis">' + "".join(f"<span>{escape(m)}</span>" for m in marks) + "</div>"
+
+
+def _clip_axis(take: Take) -> str:
+    """Where each clip begins and ends on the line."""
+    edges, places = [0.0], _places(take)
+    for index in range(1, len(take.shots)):
+        if take.shots[index].clip != take.shots[index - 1].clip:
+            edges.append((places[index - 1] + places[index]) / 2)
+    numbers = list(dict.fromkeys(shot.clip for shot in take.shots))
+    parts = "".join(
+        f'<span style="flex:0 0 {100 * (end - start):.2f}%">{number + 1}: '
+        f"{escape(take.clips[number].name)}</span>"
+        for number, start, end in zip(numbers, edges, [*edges[1:], 1.0], strict=True)
+    )
+    return f'<div class="axis clips">{parts}</div>'
 
 
 def _space(take: Take, around: Around | None) -> str:
@@ -276,7 +329,7 @@ def _picked(take: Take, num_pictures: int) -> list[int]:
     count = min(num, num_pictures)
     even = {round(i * (num - 1) / max(count - 1, 1)) for i in range(count)}
     lost = [index for index, shot in enumerate(take.shots) if shot.is_placed is False]
-    return sorted(even | {(a + b) // 2 for a, b in spans(lost)[: num_pictures or 0]})
+    return sorted(even | {(a + b) // 2 for a, b in spans(take, lost)[: num_pictures or 0]})
 
 
 def _strip(take: Take, paths: Sequence[Path], num_pictures: int) -> str:
@@ -290,7 +343,7 @@ def _strip(take: Take, paths: Sequence[Path], num_pictures: int) -> str:
             picture = look_at(paths[index])[1]
         except OSError:  # a picture that is gone is left out of the strip
             continue
-        label = clock(shot.time_s) if shot.time_s is not None else (shot.name or shot.file)
+        label = _moment(take, index)
         cause = causes[index]
         notes = [_CAUSES[cause]] if cause is not None else []
         if cause is None and shot.is_placed is False:

@@ -3,17 +3,20 @@
 Fixed keys: version, verdict (good, usable, poor, unusable, or null where the job ended before that
 was known, and not for what the capture is), reasons[], advice[] (sentences, the most useful first),
 findings[] {code, severity, what, advice, spans[], measured}, error (null, or stage, code, message,
-hint), capture {kind, filename, duration_s}, pictures {num, num_placed, ratio}, lost {num, seconds,
-spans[]}, parallax_deg, metric, given_poses (null, or of poses that came along verdict, why and
-error_px, by which matches miss them), around (null, or covered_deg, widest_gap_deg, heights_deg,
-sectors[36]), timeline[] one entry a picture {file, name, time_s, placed, cause, blur_px, luma,
-speed, exposure_ev, num_features, best_matches}, path[] {file, center}. A span is {first, last} and
-of a film {from_s, to_s}. Units: pixels of a picture of 640, long sides of the picture per second,
-stops since the first frame, degrees, world units.
+hint), capture {kind, filename, duration_s}, clips[] (of a film in several: name, offset_s,
+length_s, num, num_placed, is_apart, most_shared), pictures {num, num_placed, ratio}, lost {num,
+seconds, spans[]}, parallax_deg, metric, given_poses (null, or of poses that came along verdict, why
+and error_px, by which matches miss them), around (null, or covered_deg, widest_gap_deg,
+heights_deg, sectors[36]), timeline[] one entry a picture {file, name, clip, time_s, placed, cause,
+blur_px, luma, speed, exposure_ev, num_features, best_matches}, path[] {file, center}. A span is
+{first, last} and of a film {from_s, to_s}, of several clips with the number of its `clip`, whose
+own times these are less its offset_s. Units: pixels of a picture of 640, long sides of the picture
+per second, stops since the first frame, degrees, world units.
 """
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 from pipelines.filming.around import look_around
@@ -42,6 +45,7 @@ def build_report(take: Take, thresholds: Thresholds | None = None) -> dict[str, 
             "filename": take.filename,
             "duration_s": take.duration_s,
         },
+        "clips": _clips(take),
         "pictures": {
             "num": num,
             "num_placed": take.num_placed if take.was_sought else None,
@@ -67,6 +71,19 @@ def build_report(take: Take, thresholds: Thresholds | None = None) -> dict[str, 
     }
 
 
+def _clips(take: Take) -> list[dict[str, Any]]:
+    return [
+        {
+            **asdict(clip),
+            "num": sum(shot.clip == number for shot in take.shots),
+            "num_placed": sum(shot.clip == number and shot.is_placed is True for shot in take.shots)
+            if take.was_sought
+            else None,
+        }
+        for number, clip in enumerate(take.clips)
+    ]
+
+
 def _given(take: Take) -> dict[str, Any] | None:
     if take.given is None:
         return None
@@ -84,7 +101,7 @@ def _given(take: Take) -> dict[str, Any] | None:
 def lost_of(take: Take) -> dict[str, Any]:
     """Pictures without a pose: how many, how many seconds they stand for, and which stretches."""
     lost = [index for index, shot in enumerate(take.shots) if shot.is_placed is False]
-    stretches = [_stretch(take, span) for span in spans(lost)]
+    stretches = [_stretch(take, span) for span in spans(take, lost)]
     if not take.is_film or take.duration_s is None:
         return {"num": len(lost), "seconds": None, "spans": stretches}
     each_s = take.duration_s / max(len(take.shots), 1)
@@ -96,6 +113,8 @@ def _stretch(take: Take, span: tuple[int, int]) -> dict[str, Any]:
     found: dict[str, Any] = {"first": first.name or first.file, "last": last.name or last.file}
     if first.time_s is not None and last.time_s is not None:
         found |= {"from_s": round(first.time_s, 2), "to_s": round(last.time_s, 2)}
+    if take.clips:
+        found["clip"] = first.clip
     return found
 
 
@@ -121,6 +140,7 @@ def _timeline(take: Take) -> list[dict[str, Any]]:
         {
             "file": shot.file,
             "name": shot.name,
+            "clip": shot.clip,
             "time_s": shot.time_s,
             "placed": shot.is_placed,
             "cause": cause,

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipelines.captures.archive_rules import shown
 from pipelines.captures.record import CAPTURE_JSON, CaptureRecord
 from pipelines.exports.formats.ply import read_ply
 from pipelines.filming.looks import Look, look_at
@@ -58,6 +59,21 @@ class Shot:
 
 
 @dataclass(frozen=True)
+class Clip:
+    """One of several clips. name: what its sender called it. offset_s: where its own times begin in
+    those of the capture, length_s long. is_apart: whether hardly any of its frames is placed with
+    those of other clips, None where nobody looked. most_shared: details that one of its frames
+    shares with a frame of another clip.
+    """
+
+    name: str
+    offset_s: float
+    length_s: float
+    is_apart: bool | None = None
+    most_shared: int | None = None
+
+
+@dataclass(frozen=True)
 class Take:
     """A capture as far as it is known.
 
@@ -67,7 +83,7 @@ class Take:
     between the directions that the same point is seen from. is_metric: whether a unit is a metre;
     None where nobody said. given: of poses that came along, how well they fit the pictures
     (`pipelines.sfm.given_report`), with `warnings`. error: what ended the job, `{stage, code,
-    message, hint, details}`.
+    message, hint, details}`. clips: of a film in several, by their numbers; none of one in one.
     """
 
     kind: str = ""
@@ -83,6 +99,12 @@ class Take:
     is_metric: bool | None = None
     given: Mapping[str, Any] | None = None
     error: Mapping[str, Any] | None = None
+    clips: tuple[Clip, ...] = ()
+
+    def clip_of(self, index: int) -> Clip | None:
+        """The clip that a picture is of, where there are several."""
+        number = self.shots[index].clip
+        return self.clips[number] if number < len(self.clips) else None
 
     @property
     def was_sought(self) -> bool:
@@ -145,9 +167,14 @@ def _listed(workspace: Workspace) -> Take:
             for image in record.images
         ]
         return replace(take, shots=tuple(shots))
-    rows = (_json(workspace.stage("frames") / "frames.json") or {}).get("frames", [])
+    film = _json(workspace.stage("frames") / "frames.json") or {}
+    rows, clips = film.get("frames", []), film.get("clips", [])
     return replace(
         take,
+        clips=tuple(
+            Clip(shown(str(clip["name"])), float(clip["offset_s"]), float(clip["duration_s"]))
+            for clip in (clips if len(clips) > 1 else [])
+        ),
         shots=tuple(
             Shot(
                 str(row["file"]),
@@ -168,6 +195,7 @@ def _with_poses(take: Take, workspace: Workspace) -> Take:
     report = failed if failed is not None else _json(workspace.stage("poses") / REPORT)
     if report is not None and "images" in report:
         take = _matched(take, report["images"])
+        take = _joined(take, report.get("clips", []))
         take = replace(
             take,
             angle_deg=report.get("median_triangulation_angle_deg"),
@@ -213,6 +241,18 @@ def _matched(take: Take, rows: list[dict[str, Any]]) -> Take:
         for shot in take.shots
     ]
     return replace(take, shots=tuple(shots))
+
+
+def _joined(take: Take, rows: list[dict[str, Any]]) -> Take:
+    """With what became of each clip that gave frames; the rows are in their order."""
+    used = sorted({shot.clip for shot in take.shots})
+    if not take.clips or len(rows) != len(used):
+        return take
+    clips = list(take.clips)
+    for number, row in zip(used, rows, strict=True):
+        known = {key: row[key] for key in ("is_apart", "most_shared")}
+        clips[number] = replace(clips[number], **known)
+    return replace(take, clips=tuple(clips))
 
 
 def _partly_placed(take: Take, placed: dict[str, Any] | None) -> Take:

@@ -37,7 +37,8 @@ class Source:
     neighbours in the list are neighbours in time. exif: what the record says of each photo.
     clips: of a film, the clip that each frame is of, ascending; neighbours of one clip only are
     neighbours in time. views: for each image the views that were cut from it, none of one that is
-    no panorama; of a capture without panoramas nothing at all.
+    no panorama; of a capture without panoramas nothing at all. clip_names: what the sender called
+    each clip, by its number.
     """
 
     root: Path
@@ -47,6 +48,7 @@ class Source:
     exif: tuple[Mapping[str, Any], ...] = ()
     clips: tuple[int, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
+    clip_names: tuple[str, ...] = ()
 
     @property
     def has_panoramas(self) -> bool:
@@ -56,6 +58,11 @@ class Source:
     def views_of(self, index: int) -> tuple[str, ...]:
         """The views cut from an image, which is a panorama then; none of any other."""
         return self.views[index] if self.views else ()
+
+    def clip_name(self, index: int) -> str:
+        """What the sender called the clip that an image is of; "" where it has no name."""
+        number = self.clips[index] if self.clips else 0
+        return self.clip_names[number] if number < len(self.clip_names) else ""
 
     @property
     def stretches(self) -> list[range]:
@@ -78,11 +85,21 @@ def read_source(workspace: Workspace) -> Source:
     root = workspace.images_root
     listing = root / "frames.json"
     if listing.is_file():
-        frames = json.loads(listing.read_text("utf-8"))["frames"]
+        film = json.loads(listing.read_text("utf-8"))
+        frames = film["frames"]
+        names = tuple(str(clip["name"]) for clip in film.get("clips", ()))
         files = tuple(str(frame["file"]) for frame in frames)
         times = tuple(_seconds(frame["timestamp_s"]) for frame in frames)
         clips = tuple(int(frame.get("clip", 0)) for frame in frames)
-        source = Source(root, files, times, is_video=True, clips=clips, views=_views(frames))
+        source = Source(
+            root,
+            files,
+            times,
+            is_video=True,
+            clips=clips,
+            views=_views(frames),
+            clip_names=names,
+        )
     else:
         capture = json.loads((root / "capture.json").read_text("utf-8"))
         files = tuple(str(image["file"]) for image in capture["images"])

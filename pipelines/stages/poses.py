@@ -24,6 +24,7 @@ from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.orientation import Normalisation, normalise, opengl_from_opencv
 from pipelines.sfm.attempts import Checkpoint, Ladder, num_processors
+from pipelines.sfm.clips import clip_warnings, clips_of
 from pipelines.sfm.found_images import FoundImages, found_images
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled
 from pipelines.sfm.report import build_report, check_usable, report_of_failure, report_of_model
@@ -53,6 +54,7 @@ _SUMMARY = (
     "intrinsics",
     "warnings",
     "models",
+    "clips",
     "gaps_s",
 )
 
@@ -81,7 +83,8 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             outcome = ladder.climb()
             model = check_usable(outcome, source, options)
         except (PosesError, ToolError) as error:
-            _write_report(ctx, report_of_failure(ladder.outcome, source, options, error))
+            report = report_of_failure(ladder.outcome, source, options, error)
+            _write_report(ctx, {**report, "clips": clips_of(ladder.outcome, source)})
             raise
         model, refinement = _refine(reconstructor, model, source, options, ctx)
         if source.has_panoramas:
@@ -95,8 +98,15 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     notes = {"up_from": world.up_from, "centered_on": world.centered_on}
     write_cameras(ctx.out / "cameras.json", found, world, notes)
     write_sparse_points(ctx.out / SPARSE_POINTS, model, world)
-    report = {**build_report(outcome, source), **report_of_model(model, lenses, notes)}
+    report = {
+        **build_report(outcome, source),
+        **report_of_model(model, lenses, notes),
+        "clips": clips_of(outcome, source),
+    }
     report["subpixel"] = refinement
+    report["warnings"] = [*report["warnings"], *clip_warnings(report["clips"])]
+    for warning in clip_warnings(report["clips"]):
+        ctx.logger.warning("%s", warning["message"])
     _write_report(ctx, report)
     ctx.progress(1.0, f"{len(model.indices)} of {len(source.files)} images registered", 0.0)
     return {key: report[key] for key in _SUMMARY}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,7 @@ class PairStatistics:
     partner. num_pairs: pairs compared. num_verified: pairs with a verified geometry.
     homographies: [H, 3, 3], of the verified pairs that one homography explains (a turning camera,
     or one plane), in units of the image's long side from its centre, x right, y down.
+    verified: [V, 3] int, of each verified pair both images and its matches.
     """
 
     num_features: npt.NDArray[np.int64]
@@ -52,6 +53,7 @@ class PairStatistics:
     num_pairs: int
     num_verified: int
     homographies: npt.NDArray[np.float64]
+    verified: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
 
     @classmethod
     def nothing(cls, num_images: int) -> PairStatistics:
@@ -136,10 +138,13 @@ def read_statistics(database: Path, num_images: int) -> PairStatistics:
             "SELECT pair_id, rows, config, H FROM two_view_geometries"
         ).fetchall()
     homographies: list[npt.NDArray[np.float64]] = []
+    verified: list[tuple[int, int, int]] = []
     for pair_id, rows, config, blob in pairs:
         first, second = (images[i] for i in pycolmap.pair_id_to_image_pair(pair_id))
         for index, _, _ in (first, second):
             best[index] = max(best[index], rows)
+        if rows > 0:
+            verified.append((first[0], second[0], rows))
         if rows > 0 and config in _ONE_HOMOGRAPHY and blob:
             pixels = np.frombuffer(blob, np.float64).reshape(3, 3)
             homographies.append(
@@ -149,8 +154,9 @@ def read_statistics(database: Path, num_images: int) -> PairStatistics:
         num_features=num_features,
         best_inliers=best,
         num_pairs=len(pairs),
-        num_verified=sum(rows > 0 for _, rows, _, _ in pairs),
+        num_verified=len(verified),
         homographies=np.array(homographies, np.float64).reshape(-1, 3, 3),
+        verified=np.array(verified, np.int64).reshape(-1, 3),
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.filming.findings import CAPTURE_FAULTS, Thresholds, find, verdict_of
 from pipelines.filming.looks import Look
-from pipelines.filming.shots import Take
+from pipelines.filming.shots import Clip, Take
 from tests.unit.pipelines.filming.takes import (
     NUM,
     SHARP,
@@ -69,6 +69,43 @@ def test_fast_and_sharp_is_told_where_it_lost_the_overlap_alone() -> None:
     take = spoiled(good_take(), PART, best_inliers=3, **fast, **LOST)
     assert codes(take) == ["moved_too_fast"]
     assert codes(spoiled(good_take(), PART, **fast)) == []
+
+
+def in_clips(take: Take, *lengths: int, apart: tuple[int, ...] = ()) -> Take:
+    """The film as clips of so many frames each."""
+    number = [n for n, length in enumerate(lengths) for _ in range(length)]
+    shots = [replace(shot, clip=clip) for shot, clip in zip(take.shots, number, strict=True)]
+    clips = tuple(
+        Clip(f"take {n}.mp4", 0.5 * number.index(n), 0.5 * length, n in apart, 11)
+        for n, length in enumerate(lengths)
+    )
+    return replace(take, shots=tuple(shots), clips=clips)
+
+
+def said_of(take: Take, code: str) -> str:
+    """What is said of the one finding with that code, whatever else is."""
+    (finding,) = [one for one in find(take) if one.code == code]
+    return finding.what
+
+
+def test_a_clip_that_joins_no_other_is_told_with_its_own_times() -> None:
+    take = in_clips(good_take(), 20, 8, 12, apart=(1,))
+    for lost in ({"group": 1}, {"group": None, "best_inliers": 12}, {"group": None}):
+        said = said_of(spoiled(take, range(20, 28), **(LOST | lost)), "clip_apart")
+        assert said.startswith("In clip 2 (take 1.mp4) from 0:00 to 0:03 the pictures show nothing")
+        assert "11 details at most" in said
+        assert "8 of 40 frames have no pose in common" in said
+    moved = spoiled(take, range(20, 28), look=SMEARED, speed=1.4, best_inliers=3, **LOST)
+    assert "clip_apart" not in codes(moved), "what can be measured of the frames comes first"
+
+
+def test_times_are_those_of_each_clip_and_no_stretch_goes_over_its_end() -> None:
+    take = in_clips(good_take(), 20, 20)
+    said = said_of(spoiled(take, range(18, 24), best_inliers=3, **LOST), "no_overlap")
+    assert said.startswith("In clip 1 (take 0.mp4) at 0:09 and in clip 2 (take 1.mp4) ")
+    assert "clip 2 (take 1.mp4) from 0:00 to 0:01 the pictures share too little" in said
+    whole = spoiled(good_take(), range(18, 24), best_inliers=3, **LOST)
+    assert said_of(whole, "no_overlap").startswith("From 0:09 to 0:11 ")
 
 
 def test_blur_without_motion() -> None:

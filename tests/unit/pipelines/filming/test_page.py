@@ -13,7 +13,7 @@ from PIL import Image
 
 from pipelines.filming.page import build_page
 from pipelines.filming.report import build_report
-from pipelines.filming.shots import Take
+from pipelines.filming.shots import Clip, Take
 from tests.unit.pipelines.filming.takes import NUM, SMEARED, good_take, spoiled
 
 
@@ -84,6 +84,24 @@ def test_the_page_shows_verdict_advice_numbers_and_pictures(tmp_path: Path) -> N
     assert [a["class"] for a in figures].count("lost") == 1
     assert page.count('class="chart"') == 5
     assert page.count('class="map"') == page.count('class="rose"') == 1
+
+
+def test_clips_have_a_line_and_their_own_times(tmp_path: Path) -> None:
+    take = good_take()
+    shots = [replace(shot, clip=int(index >= 25)) for index, shot in enumerate(take.shots)]
+    clips = (Clip("<b>a.mp4", 0.0, 12.5, False, 90), Clip("b.mp4", 12.5, 7.5, True, 4))
+    take = spoiled(
+        replace(take, shots=tuple(shots), clips=clips), range(25, 40), is_placed=False, group=1
+    )
+    page, reader = page_of(take, tmp_path)
+    assert "<b>a.mp4" not in page
+    for said in ("<b>a.mp4", "0:12 min, 25 of 25 frames with a pose, joined"):
+        assert said in reader.text
+    assert "0:07 min, 0 of 15 frames with a pose, does not join the others" in reader.text
+    assert "clip 2, 0:03" in reader.text
+    assert "apart from the other clips" in reader.text
+    assert "2: b.mp4" in reader.text
+    assert "Clips" not in page_of(good_take(), tmp_path)[1].text
 
 
 def test_names_are_escaped(tmp_path: Path) -> None:
