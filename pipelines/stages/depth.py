@@ -28,6 +28,7 @@ from pipelines.nerf.options.train import SplitConfig, config_from_dict
 from pipelines.nerf.stereo.maps import DepthMap, Progress, find_depth_maps, surface_points
 from pipelines.nerf.stereo.planes import completed
 from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_scale
+from pipelines.nerf.stereo.standing import stood_up
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.option_models import StageOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
@@ -38,7 +39,7 @@ from pipelines.scene.stereo_views import sensor_depth, stereo_view
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 
-_LOAD_SHARE, _STEREO_SHARE, _PLANES_SHARE = 0.05, 0.83, 0.1
+_LOAD_SHARE, _STEREO_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.73, 0.1, 0.1
 _PICTURE_VIEWS = 6
 
 
@@ -78,6 +79,10 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     def on_completing(fraction: float, message: str) -> None:
         ctx.progress(_LOAD_SHARE + _STEREO_SHARE + _PLANES_SHARE * fraction, message)
 
+    def on_standing(fraction: float, message: str) -> None:
+        begun = _LOAD_SHARE + _STEREO_SHARE + _PLANES_SHARE
+        ctx.progress(begun + _WALLS_SHARE * fraction, message)
+
     summary: dict[str, Any] = {"source": "stereo", "num_maps": len(images)}
     if with_sensor:
         maps, told = _with_sensor(ctx, views, sensed, config, source, on_progress)
@@ -87,6 +92,9 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     if config.complete_planes:
         summary["matched_share"] = round(_known_share(maps), 4)
         maps = completed(views, maps, config, on_completing)
+    if config.standing_walls:
+        summary["before_walls_share"] = round(_known_share(maps), 4)
+        maps = stood_up(views, maps, config, on_standing)
     for image, view, found in zip(images, views, maps, strict=True):
         ctx.check_cancelled()
         writer.append(image.file, _pinhole(view), found)

@@ -48,3 +48,8 @@ class StereoConfig:
         "Lay patches of even brightness on the planes that all views together show, where at least "
         "half of what is known of a patch is on one and other views do not see through it.",
     )
+    standing_walls: bool = option(
+        True,
+        "Lay patches of even brightness on upright planes where they meet a floor along a line "
+        "that several views see in the same place, and other views agree.",
+    )

@@ -4,8 +4,7 @@ A white wall says nothing of where it is, in no view; but its skirting board, a 
 its corners do, each in some view. So planes are sought among the known depths of **all** views, and
 in each view a patch of even brightness whose known pixels lie on one of them is taken to lie on it
 as a whole, unless other views see through it. Sources: Gallup, Frahm, Pollefeys, "Piecewise Planar
-and Non-Planar Stereo", CVPR 2010; Romanoni, Matteucci, "TAPA-MVS", arXiv:1903.10929; patches:
-Felzenszwalb, Huttenlocher, IJCV 2004.
+and Non-Planar Stereo", CVPR 2010; Romanoni, Matteucci, "TAPA-MVS", arXiv:1903.10929.
 
 Symbols: V views, P planes (n, d) with n . X = d, n of length 1, in the world. Depth is along the
 camera's axis (z), 0 where unknown.
@@ -17,12 +16,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from skimage.segmentation import felzenszwalb
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
 from pipelines.nerf.stereo.maps import DepthMap, Progress, surface_points, votes_of_others
 from pipelines.nerf.stereo.neighbours import choose_neighbours
+from pipelines.nerf.stereo.patches import patches_of
 from pipelines.nerf.stereo.views import StereoView
 
 Depths = NDArray[np.float32]
@@ -31,10 +30,9 @@ Floats = NDArray[np.float64]
 _SAMPLES_PER_VIEW, _MOST_SAMPLES = 800, 30_000
 _NORMAL_RADIUS = 3
 _MIN_VOTES = 2
-_ON_PLANE, _ALIGNED = 0.01, 0.9
+ON_PLANE, _ALIGNED = 0.01, 0.9
 """How near a point is to its plane, relative to its depth; |cosine| between their normals."""
 _MOST_PLANES, _HYPOTHESES, _LEAST_SHARE = 24, 300, 0.01
-_PATCH_SCALE, _PATCH_SIGMA, _PATCH_SIZE = 100.0, 0.8, 60
 _MIN_KNOWN, _MIN_SHARE = 30, 0.5
 _SAMPLES_SHARE, _VOTES_SHARE = 0.25, 0.35
 _MESSAGE = "completing plain surfaces"
@@ -63,18 +61,43 @@ def completed(
         filled.append(laid_on_planes(view, found.z, planes))
         share = (1.0 - _VOTES_SHARE - _SAMPLES_SHARE) * (index + 1) / len(views)
         on_progress(_SAMPLES_SHARE + share, _MESSAGE)
+    return confirmed(
+        views,
+        maps,
+        filled,
+        neighbours,
+        config,
+        lambda agree, through: agree < through,
+        lambda done: on_progress(1.0 - _VOTES_SHARE * (1.0 - done), _MESSAGE),
+    )
+
+
+def confirmed(
+    views: Sequence[StereoView],
+    maps: Sequence[DepthMap],
+    filled: Sequence[Depths],
+    neighbours: Sequence[Sequence[int]],
+    config: StereoConfig,
+    refutes: Callable[[NDArray[np.int32], NDArray[np.int32]], NDArray[np.bool_]],
+    on_progress: Callable[[float], None],
+) -> list[DepthMap]:
+    """The filled maps, without what the neighbours' refute of the depths that the maps have not.
+
+    refutes: of the numbers of neighbours, [H, W] each, that agree and that see through.
+    on_progress: told the share that is done; may raise.
+    """
     kept = []
     for index, found in enumerate(maps):
         votes, _ = votes_of_others(index, views, filled, neighbours[index], config)
         guessed = (found.z == 0) & (filled[index] > 0)
-        refuted = guessed & (votes[AGREE] < votes[SEE_THROUGH])
+        refuted = guessed & refutes(votes[AGREE], votes[SEE_THROUGH])
         kept.append(
             DepthMap(
                 np.where(refuted, np.float32(0.0), filled[index]),
                 np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
             )
         )
-        on_progress(1.0 - _VOTES_SHARE * (1.0 - (index + 1) / len(views)), _MESSAGE)
+        on_progress((index + 1) / len(views))
     return kept
 
 
@@ -127,11 +150,11 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats) -> Depths:
     x, y = (axis.astype(np.float64) for axis in view.rays())
     known = z > 0
     inverse = np.where(known, 1.0 / np.where(known, z, 1.0), 0.0)
-    patches = _patches(view.picture)
+    patches = patches_of(view.picture)
     num_patches = int(patches.max()) + 1
 
     def near(found: Floats) -> NDArray[np.bool_]:
-        return known & (np.abs(found - inverse) < 2.0 * _ON_PLANE * inverse)
+        return known & (np.abs(found - inverse) < 2.0 * ON_PLANE * inverse)
 
     num_near = np.stack(
         [
@@ -151,21 +174,10 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats) -> Depths:
     within = found < _EXTRAPOLATED * nearest[patches]
     within &= found > np.maximum(farthest[patches] / _EXTRAPOLATED, 1e-12)
     fills = ~known & within & (view.picture >= 0.0)
-    moves = known & (np.abs(found - inverse) < _ON_PLANE * inverse)
+    moves = known & (np.abs(found - inverse) < ON_PLANE * inverse)
     taken = decided[patches] & (fills | moves)
     laid: Depths = np.where(taken, 1.0 / np.where(taken, found, 1.0), z).astype(np.float32)
     return laid
-
-
-def _patches(picture: NDArray[np.float32]) -> NDArray[np.int64]:
-    """[H, W] numbers of the patches of even brightness."""
-    found: NDArray[np.int64] = felzenszwalb(
-        np.clip(picture, 0.0, 1.0).astype(np.float64),
-        scale=_PATCH_SCALE,
-        sigma=_PATCH_SIGMA,
-        min_size=_PATCH_SIZE,
-    )
-    return found
 
 
 def _rays(view: StereoView) -> Floats:
@@ -206,6 +218,12 @@ def _samples(
         return every
     some = rng.choice(len(every[0]), _MOST_SAMPLES, replace=False)
     return every[0][some], every[1][some], every[2][some]
+
+
+def known_samples(views: Sequence[StereoView], maps: Sequence[DepthMap]) -> tuple[Floats, Floats]:
+    """Some of the points that the maps know, [K, 3], world, and their depths [K]."""
+    points, _, depths = _samples(views, maps, np.random.default_rng(0), lambda fraction: None)
+    return points, depths
 
 
 def _normals(rays: Floats, z: Depths) -> tuple[Floats, NDArray[np.bool_]]:
@@ -257,7 +275,7 @@ def _on_plane(
     """[K]: which points lie on the plane and face as it does."""
     away = np.abs(points @ plane[:3] - plane[3])
     aligned = np.abs(normals @ plane[:3]) > 1.0 - slack * (1.0 - _ALIGNED)
-    on: NDArray[np.bool_] = (away < slack * _ON_PLANE * depths) & aligned
+    on: NDArray[np.bool_] = (away < slack * ON_PLANE * depths) & aligned
     return on
 
 

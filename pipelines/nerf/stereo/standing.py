@@ -1,0 +1,391 @@
+"""Plain walls, which nothing can match, stood up where the floor ends.
+
+A white wall with nothing on it has no known point at all. But it meets the floor, and where it does
+every view sees the same line in space: the edge of the floor against a plain patch. (Where a thing
+merely hides the floor, each view sees another line on it.) So lines are sought among the places on
+floors where plain patches begin; through each goes an upright plane; and in each view a plain patch
+is laid on the planes that its border touches, if other views agree. What may be a floor: a plane
+about level, below which nothing is known, as the edge of a table is just such a line before a plain
+backdrop. No wall has cameras on both of its sides. Walls at right angles to floors: Furukawa,
+Curless, Seitz, Szeliski, "Manhattan-world stereo", CVPR 2009.
+
+Symbols as in `stereo.planes`: planes [P, 4] (n, d) with n . X = d, n of length 1, in the world.
+Depth is along the camera's axis (z), 0 where unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.segmentation import expand_labels
+
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.maps import DepthMap, Progress, surface_points
+from pipelines.nerf.stereo.neighbours import choose_neighbours
+from pipelines.nerf.stereo.patches import Labels, even_patches
+from pipelines.nerf.stereo.planes import ON_PLANE, Floats, confirmed, find_planes, known_samples
+from pipelines.nerf.stereo.views import StereoView
+
+Depths = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Numbers = NDArray[np.int64]
+
+_LEAST_AREA, _MOST_KNOWN = 0.004, 0.5
+"""A patch is open if it is so large, of the picture, and no more of it is known."""
+_LEAST_INSIDE = 0.5
+"""What is thinner is an edge that is not sharp, neither here nor there."""
+_REACH_PX = 5
+"""Matching takes squares, so depths next to an edge are not to be had, or are the other side's."""
+_LEVEL = 0.8
+_BELOW, _MOST_BELOW = 0.03, 0.02
+"""Of known points, so many may seem to lie below a floor by so much of their depth."""
+_MOST_LINES, _HYPOTHESES = 12, 400
+_LEAST_PX, _LEAST_VIEWS, _LEAST_VIEW_PX, _MOST_VIEW_PX = 60, 4, 8, 60
+_LEAST_LENGTH = 0.03
+"""Of a line between two points that stand for one, relative to their depth."""
+_LEAST_SPREAD_DEG = 1.0
+_BEHIND = 0.02
+_SAME_DEG = 4.0
+_TOUCH_PX, _TOUCH_SHARE, _MOST_TOUCHED = 12, 0.12, 3
+_BENEATH_WEIGHT = 0.5
+_EXTRAPOLATED = 3.0
+_LEAST_AGREEING, _PER_REFUSAL = 2, 2
+_LOOK_SHARE, _LAY_SHARE = 0.4, 0.7
+_MESSAGE = "standing walls up"
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A view's open patches, and the places of their borders that have a known depth next to them.
+
+    patches: [H, W]. open_patches: their numbers. Of each of K places: x, y, its ray at z = 1; the
+    patch; z: the depth that is known next to it, in another patch; plane: which one that lies on,
+    or -1.
+    """
+
+    view: StereoView
+    patches: Labels
+    open_patches: Numbers
+    x: Floats
+    y: Floats
+    patch: Numbers
+    z: Floats
+    plane: Numbers
+
+
+@dataclass(frozen=True)
+class _Wall:
+    """An upright plane [4], and the number of the floor that it stands on."""
+
+    plane: Floats
+    floor: int
+
+
+def stood_up(
+    views: Sequence[StereoView],
+    maps: Sequence[DepthMap],
+    config: StereoConfig,
+    on_progress: Progress = lambda fraction, message: None,
+) -> list[DepthMap]:
+    """The maps with plain patches on the walls that their borders with the floor tell of.
+
+    Only unknown pixels change: they get their wall's depth where at least two neighbours agree, and
+    twice as many as see through it.
+    """
+    planes = find_planes(views, maps)
+    points, depths = known_samples(views, maps)
+    floors = _floors(views, planes, points, depths)
+    if not floors:
+        return list(maps)
+    looks = []
+    for index, (view, found) in enumerate(zip(views, maps, strict=True)):
+        looks.append(_look(view, found.z, planes))
+        on_progress(_LOOK_SHARE * (index + 1) / len(views), _MESSAGE)
+    walls = [
+        wall
+        for wall in _find_walls(looks, planes, floors)
+        if not _is_known(wall.plane, planes, float(np.median(depths)))
+    ]
+    if not walls:
+        return list(maps)
+    every = np.vstack([planes, [wall.plane for wall in walls]])
+    stands_on = [-1] * len(planes) + [wall.floor for wall in walls]
+    filled = []
+    for index, (look, found) in enumerate(zip(looks, maps, strict=True)):
+        filled.append(_laid(look, found.z, every, stands_on))
+        share = (_LAY_SHARE - _LOOK_SHARE) * (index + 1) / len(views)
+        on_progress(_LOOK_SHARE + share, _MESSAGE)
+    seen = surface_points(views, [found.z for found in maps])
+    neighbours = choose_neighbours(views, seen, config.num_neighbours, config.best_angle_deg)
+    return confirmed(
+        views,
+        maps,
+        filled,
+        neighbours,
+        config,
+        lambda agree, through: agree < np.maximum(_LEAST_AGREEING, _PER_REFUSAL * through),
+        lambda done: on_progress(_LAY_SHARE + (1.0 - _LAY_SHARE) * done, _MESSAGE),
+    )
+
+
+def _floors(
+    views: Sequence[StereoView], planes: Floats, points: Floats, depths: Floats
+) -> list[int]:
+    """Numbers of the planes that are about level, and below which nothing is known.
+
+    Which way is up: as the pictures have it in the mean. points: [K, 3], with their depths [K].
+    """
+    up = np.mean([-view.world_from_camera[:, 1] for view in views], axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    found = []
+    for number, plane in enumerate(planes):
+        level = float(plane[:3] @ up)
+        height = (points @ plane[:3] - plane[3]) * np.sign(level)
+        if abs(level) >= _LEVEL and (height < -_BELOW * depths).mean() <= _MOST_BELOW:
+            found.append(number)
+    return found
+
+
+def _inverse_depths(view: StereoView, planes: Floats, x: Floats, y: Floats) -> Floats:
+    """[P, ...], 1 / z of each plane along rays to (x, y, 1); not positive where a ray misses it."""
+    apart = planes[:, 3] - planes[:, :3] @ view.center
+    apart = np.where(np.abs(apart) < 1e-9, 1e-9, apart)
+    turned = planes[:, :3] @ view.world_from_camera[:, :3] / apart[:, None]
+    return np.stack([x * a + (y * b + c) for a, b, c in turned])
+
+
+def _pixels(view: StereoView) -> tuple[Floats, Floats]:
+    """x [W] and y [H, 1] of the pixels' rays."""
+    x, y = view.rays()
+    return x.astype(np.float64), y.astype(np.float64)[:, None]
+
+
+def _look(view: StereoView, z: Depths, planes: Floats) -> _Look:
+    patches = even_patches(view.picture)
+    known, usable = z > 0, view.picture >= 0.0
+    num = int(patches.max()) + 1
+    area = np.bincount(patches.ravel(), minlength=num)
+    num_known = np.bincount(patches[known], minlength=num)
+    edges = _edges(patches)
+    inside = np.bincount(patches[~edges], minlength=num)
+    is_open = (area >= _LEAST_AREA * patches.size) & (num_known < _MOST_KNOWN * area)
+    is_open &= inside >= _LEAST_INSIDE * area
+    places = np.arange(patches.size).reshape(patches.shape)
+    expand: Any = expand_labels
+    nearest = expand(np.where(known & ~is_open[patches], places + 1, 0), _REACH_PX)
+    border = edges & is_open[patches] & (nearest > 0) & usable
+    here, there = np.nonzero(border), np.unravel_index(nearest[border] - 1, patches.shape)
+    columns, rows = (axis.ravel() for axis in _pixels(view))
+    depth = z[there].astype(np.float64)
+    off = np.abs(_inverse_depths(view, planes, columns[there[1]], rows[there[0]]) * depth - 1.0)
+    plane = off.argmin(axis=0)
+    plane = np.where(off[plane, np.arange(len(plane))] < ON_PLANE, plane, -1)
+    # An edge is some pixels wide: it is half way between what is plain and what is known.
+    x = 0.5 * (columns[here[1]] + columns[there[1]])
+    y = 0.5 * (rows[here[0]] + rows[there[0]])
+    inverse = _inverse_depths(view, planes, x, y)[plane, np.arange(len(plane))]
+    depth = np.where((plane >= 0) & (inverse > 1e-9), 1.0 / np.maximum(inverse, 1e-9), depth)
+    patch = patches[border].astype(np.int64)
+    return _Look(view, patches, np.flatnonzero(is_open), x, y, patch, depth, plane)
+
+
+def _edges(patches: Labels) -> Bools:
+    """[H, W]: the pixels that have one of another patch above, below or beside them."""
+    edges = np.zeros(patches.shape, bool)
+    down, right = patches[:-1] != patches[1:], patches[:, :-1] != patches[:, 1:]
+    edges[:-1] |= down
+    edges[1:] |= down
+    edges[:, :-1] |= right
+    edges[:, 1:] |= right
+    return edges
+
+
+def _find_walls(looks: Sequence[_Look], planes: Floats, floors: Sequence[int]) -> list[_Wall]:
+    rng = np.random.default_rng(0)
+    centers = np.stack([look.view.center for look in looks])
+    walls = []
+    for floor in floors:
+        places, depths, views, pieces = _ends_of(floor, looks)
+        normal = planes[floor, :3]
+        along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+        axes = np.stack([along / np.linalg.norm(along), np.cross(normal, along)])
+        axes[1] /= np.linalg.norm(axes[1])
+        flat = places @ axes.T
+        for _ in range(_MOST_LINES):
+            line = _best_line(flat, depths, views, pieces, rng)
+            if line is None:
+                break
+            away = np.abs(flat @ line[:2] - line[2])
+            on_it = away < ON_PLANE * depths
+            seen_by = np.flatnonzero(np.bincount(views[on_it]) >= _LEAST_VIEW_PX)
+            facing = line[:2] @ axes
+            plane = np.append(facing, line[2])
+            direction, some = np.cross(normal, facing), places[on_it][0]
+            if (
+                len(seen_by) >= _LEAST_VIEWS
+                and _spread_deg(centers[seen_by] - some, direction) >= _LEAST_SPREAD_DEG
+                and _share_behind(centers, plane) <= _BEHIND
+            ):
+                walls.append(_Wall(plane, floor))
+            left = away >= 2.0 * ON_PLANE * depths
+            flat, depths, views, pieces = flat[left], depths[left], views[left], pieces[left]
+            places = places[left]
+    return walls
+
+
+def _ends_of(floor: int, looks: Sequence[_Look]) -> tuple[Floats, Floats, Numbers, Numbers]:
+    """Where open patches begin on a floor: [K, 3] world, and of each its depth, view and patch."""
+    places, depths = [np.zeros((0, 3))], [np.zeros(0)]
+    views, pieces = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    begun = 0
+    for number, look in enumerate(looks):
+        at = look.plane == floor
+        depth = look.z[at]
+        local = np.stack([look.x[at] * depth, look.y[at] * depth, depth], axis=-1)
+        places.append(local @ look.view.world_from_camera[:, :3].T + look.view.center)
+        depths.append(depth)
+        views.append(np.full(len(depth), number))
+        pieces.append(begun + look.patch[at])
+        begun += int(look.patches.max()) + 1
+    return (
+        np.concatenate(places),
+        np.concatenate(depths),
+        np.concatenate(views),
+        np.concatenate(pieces),
+    )
+
+
+def _best_line(
+    places: Floats, depths: Floats, views: Numbers, pieces: Numbers, rng: np.random.Generator
+) -> Floats | None:
+    """The line (a, b, c) with (a, b) . X = c and a^2 + b^2 = 1 that most views show, if any.
+
+    places: [K, 2] on the floor, with their depths, views and patches. By RANSAC over pairs of the
+    same patch; one view's pixels count up to 60, or one that is near it would outvote all others.
+    """
+    if len(places) < _LEAST_PX:
+        return None
+    one = rng.integers(0, len(places), _HYPOTHESES)
+    order = np.argsort(pieces, kind="stable")
+    begin = np.searchsorted(pieces[order], pieces[one], "left")
+    end = np.searchsorted(pieces[order], pieces[one], "right")
+    two = order[begin + (rng.random(len(one)) * (end - begin)).astype(np.int64)]
+    step = places[two] - places[one]
+    length = np.linalg.norm(step, axis=1)
+    far = length > _LEAST_LENGTH * depths[one]
+    best, most = None, float(_LEAST_PX)
+    for at, (x, y) in zip(places[one[far]], step[far] / length[far, None], strict=True):
+        across = np.array([-y, x])
+        on_it = np.abs((places - at) @ across) < ON_PLANE * depths
+        count = np.bincount(views[on_it])
+        votes = float(np.minimum(count, _MOST_VIEW_PX).sum())
+        if votes >= most and (count >= _LEAST_VIEW_PX).sum() >= _LEAST_VIEWS:
+            best, most = np.append(across, across @ at), votes
+    if best is None:
+        return None
+    for _ in range(3):
+        on_it = np.abs(places @ best[:2] - best[2]) < ON_PLANE * depths
+        weight = 1.0 / depths[on_it]
+        middle = weight @ places[on_it] / weight.sum()
+        _, _, axes = np.linalg.svd((places[on_it] - middle) * weight[:, None], full_matrices=False)
+        best = np.append(axes[1], axes[1] @ middle)
+    return best
+
+
+def _spread_deg(to_centers: Floats, direction: Floats) -> float:
+    """The largest angle, seen along the line, between cameras [V, 3]: how much it would move if it
+    were the edge of something that hides the floor.
+    """
+    normal = np.cross(to_centers, direction)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return float(np.degrees(np.arccos(np.clip(np.abs(normal @ normal.T).min(), 0.0, 1.0))))
+
+
+def _share_behind(centers: Floats, plane: Floats) -> float:
+    """How many of the cameras are on the side of a wall where fewer are, [0, 0.5]."""
+    before = float((centers @ plane[:3] > plane[3]).mean())
+    return min(before, 1.0 - before)
+
+
+def _is_known(wall: Floats, planes: Floats, depth: float) -> bool:
+    """Whether one of the planes is the same, at points as far away as that."""
+    turn = planes[:, :3] @ wall[:3]
+    aligned = np.abs(turn) > np.cos(np.radians(_SAME_DEG))
+    close = np.abs(planes[:, 3] * np.sign(turn) - wall[3]) < ON_PLANE * depth
+    return bool((aligned & close).any())
+
+
+def _laid(look: _Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> Depths:
+    """The map [H, W] with its open patches on the planes that their borders touch.
+
+    planes: [P, 4], those known and the walls. stands_on: of each the floor, or -1. A border touches
+    a plane where the depth that is known next to it is the plane's; next to the plane itself that
+    says nothing, as plain things before a floor have floor all around them.
+    Where several planes are touched the patch is a corner: the nearer of them all over, as inside
+    of a room, or the farther, as outside of a box, whichever more of the border agrees with.
+    """
+    laid = z.copy()
+    pixels = _pixels(look.view)
+    for patch in np.intersect1d(look.open_patches, look.patch):
+        at = look.patch == patch
+        depth, own = look.z[at], look.plane[at]
+        relative = _inverse_depths(look.view, planes, look.x[at], look.y[at]) * depth
+        touches = np.abs(relative - 1.0) < 2.0 * ON_PLANE
+        touches[own[own >= 0], np.flatnonzero(own >= 0)] = False
+        beneath = (relative < 1.0 - 2.0 * ON_PLANE) & (own == np.array(stands_on)[:, None])
+        beneath &= own >= 0
+        chosen = _touched(touches, relative, beneath)
+        if not chosen:
+            continue
+        inverse = _inverse_depths(look.view, planes[chosen], *pixels)
+        found = inverse.max(axis=0)
+        if _agreeing(_farther(relative[chosen])) > _agreeing(relative[chosen].max(axis=0)):
+            found = _farther(inverse)
+        fits = (look.patches == patch) & (laid == 0) & (look.view.picture >= 0.0)
+        fits &= (found > (1.0 / depth).min() / _EXTRAPOLATED) & (
+            found < _EXTRAPOLATED * (1.0 / depth).max()
+        )
+        for floor in {stands_on[plane] for plane in chosen} - {-1}:
+            ground = _inverse_depths(look.view, planes[[floor]], *pixels)[0]
+            fits &= (ground <= 1e-9) | (found >= (1.0 - 2.0 * ON_PLANE) * ground)
+        laid[fits] = (1.0 / found[fits]).astype(np.float32)
+    return laid
+
+
+def _farther(inverse: Floats) -> Floats:
+    """Of planes [C, ...] the one behind the others, as far as all are before the camera."""
+    least: Floats = inverse.min(axis=0)
+    return np.where(least > 0.0, least, inverse.max(axis=0))
+
+
+def _touched(touches: Bools, relative: Floats, beneath: Bools) -> list[int]:
+    """The planes that explain the border of a patch, at most three.
+
+    touches: [P, K]. relative: [P, K], the known depth next to the border by the plane's; where it
+    is above 1 the patch would hide what is known, which walls rarely do. beneath: [P, K], whether
+    it would be below the floor that it stands on, as walls are, in corners, beyond the next one.
+    """
+    left = np.ones(touches.shape[1], bool)
+    least = max(_TOUCH_PX, _TOUCH_SHARE * touches.shape[1])
+    chosen: list[int] = []
+    refused = np.zeros(len(touches), bool)
+    while len(chosen) < _MOST_TOUCHED:
+        count = np.where(refused, 0, (touches & left).sum(axis=1))
+        plane = int(count.argmax())
+        if count[plane] < least:
+            break
+        hides = int(((relative[plane] > 1.0 + 2.0 * ON_PLANE) & left).sum())
+        if count[plane] < max(hides, _BENEATH_WEIGHT * (beneath[plane] & left).sum()):
+            refused[plane] = True
+            continue
+        chosen.append(plane)
+        left &= ~touches[plane]
+    return chosen
+
+
+def _agreeing(relative: Floats) -> int:
+    return int((np.abs(relative - 1.0) < 2.0 * ON_PLANE).sum())

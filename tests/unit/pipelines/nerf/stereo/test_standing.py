@@ -1,0 +1,106 @@
+"""Blank walls stood up where the floor ends, and what only looks like one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.nerf.stereo.standing import stood_up
+from tests.unit.pipelines.nerf.stereo.blank_room import WALL, Seen, look, walk
+
+CONFIG = StereoConfig(num_neighbours=5)
+
+
+def stood(seen: list[Seen], maps: list[DepthMap] | None = None) -> list[DepthMap]:
+    return stood_up([one.view for one in seen], maps or [one.known() for one in seen], CONFIG)
+
+
+def test_a_blank_wall_stands_where_the_floor_ends() -> None:
+    seen = [look(place) for place in walk()]
+    told: list[float] = []
+    found = stood_up(
+        [one.view for one in seen],
+        [one.known() for one in seen],
+        CONFIG,
+        lambda share, message: told.append(share),
+    )
+    for one, after in zip(seen, found, strict=True):
+        wall = ~one.on_floor
+        assert wall.sum() > 3000
+        assert (after.z[wall] > 0).mean() > 0.8
+        there = wall & (after.z > 0)
+        assert np.abs(after.z[there] / one.depth[there] - 1.0).max() < 0.02
+        assert (after.votes[there] >= 2).all()
+        assert np.array_equal(after.z[~wall], one.known().z[~wall])
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_a_corner_of_blank_walls_is_two_planes() -> None:
+    """The cameras look along the floor's diagonal, so that its end is one line and then another."""
+    seen = [look(place, turn=0.5 * (-1) ** i) for i, place in enumerate(walk())]
+    found = stood(seen)
+    errors = [
+        np.abs(after.z / one.depth - 1.0)[~one.on_floor & (after.z > 0)]
+        for one, after in zip(seen, found, strict=True)
+    ]
+    assert np.quantile(np.concatenate(errors), 0.95) < 0.02
+    assert sum(len(error) for error in errors) > 0.7 * sum((~one.on_floor).sum() for one in seen)
+
+
+def test_what_hangs_before_a_floor_stands_on_no_line_of_it() -> None:
+    """Its lower edge hides another line of the floor in each view."""
+    seen = [look(place, box=(2.2, 1.2)) for place in walk()]
+    found = stood(seen)
+    for one, after in zip(seen, found, strict=True):
+        board = one.view.picture == np.float32(0.15)
+        assert board.sum() > 300
+        assert (after.z[board] > 0).mean() < 0.01
+
+
+def test_a_table_with_a_floor_below_it_has_no_walls() -> None:
+    """Its end looks the same, but where there is something below a plane it is no floor."""
+    seen = [look(place, backdrop=9.0) for place in walk()]
+    maps = [one.known() for one in seen]
+    assert any((after.z > before.z).any() for before, after in zip(maps, stood(seen), strict=True))
+    deep = []
+    for one in seen:
+        z = one.known().z.copy()
+        z[-30:, :40] *= 1.5  # beside the table, below it
+        deep.append(DepthMap(z, np.where(z > 0, 4, 0).astype(np.uint8)))
+    for before, after in zip(deep, stood(seen, deep), strict=True):
+        assert np.array_equal(before.z, after.z)
+
+
+def test_no_wall_has_cameras_on_both_sides() -> None:
+    """Who walks round a table sees its ends before a plain room from all around."""
+    across = [(0.4 * i - 0.6, -0.2 * (i % 2), 2 * WALL - 0.3 * i) for i in range(4)]
+    seen = [look(place, backdrop=9.0) for place in walk()]
+    seen += [look(place, turn=np.pi, backdrop=9.0) for place in across]
+    maps = [one.known() for one in seen]
+    for before, after in zip(maps, stood(seen), strict=True):
+        assert np.array_equal(before.z, after.z)
+
+
+def test_a_wall_that_others_see_through_is_not_believed() -> None:
+    """Three of the views know what is behind it."""
+    seen = [look(place) for place in walk()]
+    maps = [one.known() for one in seen]
+    for index in (2, 3, 4, 5, 6):
+        far = np.where(seen[index].on_floor, maps[index].z, 3.0 * seen[index].depth)
+        maps[index] = dataclasses.replace(maps[index], z=far.astype(np.float32))
+    found = stood(seen, maps)
+    for index in (0, 1, 7):
+        assert np.array_equal(found[index].z, maps[index].z)
+
+
+def test_views_without_any_depth_stay_as_they_are() -> None:
+    seen = [look(place) for place in walk()[:3]]
+    nothing = [
+        DepthMap(np.zeros_like(one.depth), np.zeros(one.depth.shape, np.uint8)) for one in seen
+    ]
+    for after in stood(seen, nothing):
+        assert not after.z.any()
