@@ -62,7 +62,7 @@ class Door(Gate):
         for one in sockets:
             _shut(one)
 
-    def _serve(self, near: socket.socket) -> None:
+    def _serve(self, near: socket.socket, number: int) -> None:
         assert self._reach is not None
         self._open.wait()
         if self._fails("refuse"):
