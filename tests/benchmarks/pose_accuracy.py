@@ -197,11 +197,24 @@ def judge(
         report["num_registered"],
         errors,
         scale,
-        report["mean_reprojection_error_px"],
+        error_px_of(report),
         s.frames,
         s.poses,
         rungs_of(report),
     )
+
+
+def error_px_of(report: dict[str, Any]) -> float | None:
+    """The mean reprojection error; of given poses by how much matches miss them, the median of
+    pairs: those that were set aside, where poses were refined."""
+    given = report.get("given")
+    if not given:
+        return float(report["mean_reprojection_error_px"])
+    refinement = given["refinement"]
+    fit = (
+        refinement["after" if refinement["taken"] else "before"] if refinement else given["sampled"]
+    )
+    return None if fit is None else float(fit["error_px"])
 
 
 def rungs_of(report: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipelines.sample.align import path_extent
+from pipelines.sample.align import path_extent, similarity
 from pipelines.sample.film import (
     NUM_FRAMES,
     SAMPLE_TAKE,
@@ -64,13 +64,18 @@ class Case:
 
 
 def drifted(truth: CamerasFile) -> CamerasFile:
-    """The same cameras as an app would have them: off by a little, smoothly along the way."""
-    poses = np.array([pose_matrix(image) for image in truth.images])
+    """The same cameras as an app would have them: off by a little, smoothly along the way, but at
+    the scale of the true ones as a whole, since nothing in pictures tells a wrong one."""
+    true = np.array([pose_matrix(image) for image in truth.images])
+    poses = true.copy()
     along = np.linspace(0.0, 2 * np.pi, len(poses))
     waves = np.stack([np.sin(along), np.cos(1.3 * along + 1.0), np.sin(0.7 * along + 2.0)], 1)
     turns = Rotation.from_rotvec(np.radians(DRIFT_DEG) * waves[:, ::-1]).as_matrix()
     poses[:, :, :3] = turns @ poses[:, :, :3]
     poses[:, :, 3] += DRIFT * path_extent(poses[:, :, 3]) * waves
+    middle = poses[:, :, 3].mean(axis=0)
+    scale = similarity(poses[:, :, 3], true[:, :, 3]).scale
+    poses[:, :, 3] = middle + scale * (poses[:, :, 3] - middle)
     images = tuple(
         replace(image, world_from_camera=tuple(tuple(map(float, row)) for row in pose))
         for image, pose in zip(truth.images, poses, strict=True)
