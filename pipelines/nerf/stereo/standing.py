@@ -15,7 +15,7 @@ Depth is along the camera's axis (z), 0 where unknown.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +43,7 @@ _REACH_PX = 5
 _LEVEL = 0.8
 _BELOW, _MOST_BELOW = 0.03, 0.02
 """Of known points, so many may seem to lie below a floor by so much of their depth."""
-_MOST_LINES, _HYPOTHESES = 12, 400
+_MOST_LINES, _HYPOTHESES, _MOST_ENDS = 12, 400, 20_000
 _LEAST_PX, _LEAST_VIEWS, _LEAST_VIEW_PX, _MOST_VIEW_PX = 60, 4, 8, 60
 _LEAST_LENGTH = 0.03
 """Of a line between two points that stand for one, relative to their depth."""
@@ -107,7 +107,7 @@ def stood_up(
         on_progress(_LOOK_SHARE * (index + 1) / len(views), _MESSAGE)
     walls = [
         wall
-        for wall in _find_walls(looks, planes, floors)
+        for wall in _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
         if not _is_known(wall.plane, planes, float(np.median(depths)))
     ]
     if not walls:
@@ -204,18 +204,28 @@ def _edges(patches: Labels) -> Bools:
     return edges
 
 
-def _find_walls(looks: Sequence[_Look], planes: Floats, floors: Sequence[int]) -> list[_Wall]:
+def _find_walls(
+    looks: Sequence[_Look],
+    planes: Floats,
+    floors: Sequence[int],
+    on_line: Callable[[], None] = lambda: None,
+) -> list[_Wall]:
+    """Walls on the lines that floors end at. on_line: called before each is sought; may raise."""
     rng = np.random.default_rng(0)
     centers = np.stack([look.view.center for look in looks])
     walls = []
     for floor in floors:
         places, depths, views, pieces = _ends_of(floor, looks)
+        if len(places) > _MOST_ENDS:
+            some = rng.choice(len(places), _MOST_ENDS, replace=False)
+            places, depths, views, pieces = places[some], depths[some], views[some], pieces[some]
         normal = planes[floor, :3]
         along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
         axes = np.stack([along / np.linalg.norm(along), np.cross(normal, along)])
         axes[1] /= np.linalg.norm(axes[1])
         flat = places @ axes.T
         for _ in range(_MOST_LINES):
+            on_line()
             line = _best_line(flat, depths, views, pieces, rng)
             if line is None:
                 break
