@@ -74,6 +74,8 @@ class Heic:
 
     quarter_turns: anticlockwise, that a viewer makes (irot). exif: as Pillow writes it. icc: a
     profile. nclx: primaries and transfer. size: width and height declared, where not the true ones.
+    tile_px: side of the tiles that it is cut into, as phones do, 0 for one piece. depth: whether a
+    depth map lies beside it.
     """
 
     quarter_turns: int = 0
@@ -82,6 +84,8 @@ class Heic:
     nclx: tuple[int, int] | None = None
     size: tuple[int, int] | None = None
     brand: bytes = b"heic"
+    tile_px: int = 0
+    depth: bool = False
 
 
 def heic(
@@ -89,52 +93,101 @@ def heic(
 ) -> bytes:
     """A picture as HEIC. pixels: [h, w, 3] as stored, even sides, uint8, or uint16 of 16 bits."""
     said = said or Heic()
-    units = _hevc(pixels, ten_bit, crf)
-    coded = b"".join(
-        struct.pack(">I", len(unit)) + unit for unit in units if unit[0] >> 1 & 63 < _VPS
-    )
-    width, height = said.size or (pixels.shape[1], pixels.shape[0])
-    properties = [_hvcc(units, ten_bit), _full(b"ispe", 0, 0, struct.pack(">II", width, height))]
-    if said.icc:
-        properties.append(_box(b"colr", b"prof", said.icc))
+    side = said.tile_px
+    height, width = pixels.shape[:2]
+    parts = [pixels]
+    if side:
+        padding = ((0, -height % side), (0, -width % side), (0, 0))
+        padded = np.pad(pixels, padding, mode="edge")
+        rows, columns = padded.shape[0] // side, padded.shape[1] // side
+        parts = [
+            padded[side * y : side * (y + 1), side * x : side * (x + 1)]
+            for y in range(rows)
+            for x in range(columns)
+        ]
+    coded = [_hevc(part, ten_bit, crf) for part in parts]
     primaries, transfer = said.nclx or (1, 13)
-    properties.append(_box(b"colr", b"nclx", struct.pack(">HHHB", primaries, transfer, 6, 0x80)))
-    if said.quarter_turns:
-        properties.append(_box(b"irot", bytes([said.quarter_turns % 4])))
-    essential = {1, len(properties)} if said.quarter_turns else {1}
-    links = bytes(n | (0x80 if n in essential else 0) for n in range(1, len(properties) + 1))
-    items = [_full(b"infe", 2, 0, struct.pack(">HH", 1, 0), b"hvc1", b"\0")]
-    data = [coded]
+    # Properties of a tile, and of the whole picture, by their numbers from 1 on.
+    properties = [_hvcc(coded[0], ten_bit), _extent(*parts[0].shape[1::-1])]
+    whole = [2] if not side and said.size is None else [3]
+    if whole == [3]:
+        properties.append(_extent(*(said.size or (width, height))))
+    for box in (
+        _box(b"colr", b"prof", said.icc) if said.icc else b"",
+        _box(b"colr", b"nclx", struct.pack(">HHHB", primaries, transfer, 6, 0x80)),
+        _box(b"irot", bytes([said.quarter_turns % 4])) if said.quarter_turns else b"",
+    ):
+        if box:
+            properties.append(box)
+            whole.append(len(properties))
+    turned = len(properties) if said.quarter_turns else 0
+    data = [
+        b"".join(struct.pack(">I", len(u)) + u for u in units if u[0] >> 1 & 63 < _VPS)
+        for units in coded
+    ]
+    num_tiles = len(data)
+    hidden = int(bool(side))
+    items = [_item(n, b"hvc1", hidden) for n in range(1, num_tiles + 1)]
+    links = {n: [1, 2] for n in range(1, num_tiles + 1)}
     references = b""
+    primary = 1
+    if side:
+        data.append(struct.pack(">BBBBHH", 0, 0, rows - 1, columns - 1, width, height))
+        primary = len(data)
+        items.append(_item(primary, b"grid"))
+        tiles = struct.pack(f">HH{num_tiles}H", primary, num_tiles, *range(1, num_tiles + 1))
+        references += _box(b"dimg", tiles)
+        links[primary] = whole
+    else:
+        links[1] = [1, *whole]
+    if said.depth:
+        data.append(b"".join(data[:1]))
+        items.append(_item(len(data), b"hvc1"))
+        properties.append(_full(b"auxC", 0, 0, b"urn:mpeg:hevc:2015:auxid:2\0"))
+        links[len(data)] = [1, 2, len(properties)]
+        references += _box(b"auxl", struct.pack(">HHH", len(data), 1, primary))
     if said.exif is not None:
-        items.append(_full(b"infe", 2, 0, struct.pack(">HH", 2, 0), b"Exif", b"\0"))
         data.append(struct.pack(">I", 6) + said.exif.tobytes())
-        references = _full(b"iref", 0, 0, _box(b"cdsc", struct.pack(">HHH", 2, 1, 1)))
+        items.append(_item(len(data), b"Exif"))
+        references += _box(b"cdsc", struct.pack(">HHH", len(data), 1, primary))
+    linked = b"".join(
+        struct.pack(">HB", item, len(numbers))
+        + bytes(n | (0x80 if n in (1, turned) else 0) for n in numbers)
+        for item, numbers in sorted(links.items())
+    )
     first = _box(b"ftyp", said.brand, bytes(4), b"mif1", b"heic")
 
     def meta(start: int) -> bytes:
-        rows = b""
+        places = b""
         for number, part in enumerate(data, start=1):
-            rows += struct.pack(">HHHII", number, 0, 1, start, len(part))
+            places += struct.pack(">HHHII", number, 0, 1, start, len(part))
             start += len(part)
         return _full(
             b"meta",
             0,
             0,
             _full(b"hdlr", 0, 0, bytes(4), b"pict", bytes(13)),
-            _full(b"pitm", 0, 0, struct.pack(">H", 1)),
-            _full(b"iloc", 0, 0, b"\x44\0", struct.pack(">H", len(data)), rows),
+            _full(b"pitm", 0, 0, struct.pack(">H", primary)),
+            _full(b"iloc", 0, 0, b"\x44\0", struct.pack(">H", len(data)), places),
             _full(b"iinf", 0, 0, struct.pack(">H", len(items)), *items),
-            references,
+            _full(b"iref", 0, 0, references) if references else b"",
             _box(
                 b"iprp",
                 _box(b"ipco", *properties),
-                _full(b"ipma", 0, 0, struct.pack(">IHB", 1, 1, len(links)), links),
+                _full(b"ipma", 0, 0, struct.pack(">I", len(links)), linked),
             ),
         )
 
     start = len(first) + len(meta(0)) + 8
     return first + meta(start) + _box(b"mdat", *data)
+
+
+def _extent(width: int, height: int) -> bytes:
+    return _full(b"ispe", 0, 0, struct.pack(">II", width, height))
+
+
+def _item(number: int, kind: bytes, hidden: int = 0) -> bytes:
+    return _full(b"infe", 2, hidden, struct.pack(">HH", number, 0), kind, b"\0")
 
 
 _SHORT, _LONG, _RATIONAL, _SRATIONAL, _ASCII, _BYTE = 3, 4, 5, 10, 2, 1

@@ -9,6 +9,7 @@ HEIF file beside its main one are ignored.
 from __future__ import annotations
 
 import functools
+import io
 import struct
 import warnings
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import BinaryIO
 
 import PIL.Image
 
+from pipelines.captures.heif_items import check_items
 from pipelines.captures.raw_photos import FORMAT as RAW
 from pipelines.captures.raw_photos import is_camera_raw, register_raw
 
@@ -44,6 +46,10 @@ def open_picture(source: Path | BinaryIO, kind: str) -> PIL.Image.Image:
     Its `format` is "RAW" for a camera raw, whatever `kind` is. Raises DAMAGED.
     """
     _add_formats()
+    if kind == "HEIF":
+        data = source.read_bytes() if isinstance(source, Path) else source.read()
+        check_items(data)
+        source = io.BytesIO(data)
     with warnings.catch_warnings():
         # Of tags that Pillow skips, and of sizes between its limit and twice that.
         warnings.simplefilter("ignore")

@@ -102,6 +102,27 @@ def test_heic_is_turned_once_and_its_lens_is_known(tmp_path: Path, turns: int) -
     assert (known["focal_mm"], known["focal_35mm"], known["model"]) == (5.7, 26.0, "Phone 9")
 
 
+def test_heic_in_tiles_with_depth_beside_it_is_one_whole_picture(tmp_path: Path) -> None:
+    """As iPhones write it: the last tiles reach over the edge, and the whole is turned."""
+    stored = smooth(3, 160, 112)
+    said = Heic(3, phone_exif(5.7, 26, 6), tile_px=64, depth=True)
+    found = arrived(tmp_path, "IMG_1.HEIC", heic(stored, said))
+    assert_shows(found, np.rot90(stored, 3))
+
+
+@pytest.mark.parametrize("kind", [b"Ex\xfff", b"\x80xif"])
+def test_heic_with_an_item_of_a_kind_that_is_no_text_is_left_out(
+    tmp_path: Path, kind: bytes
+) -> None:
+    """The library by itself ends the process at such a file."""
+    whole = heic(smooth(), Heic(exif=phone_exif(5.7, 26)))
+    files = fillers(11)
+    files["a.heic"] = whole.replace(b"Exif\0", kind + b"\0", 1)
+    summary, ctx = ingest(tmp_path, files)
+    assert len(sources(ctx)) == 11
+    assert warning_with(summary, '"a.heic" does not decode')
+
+
 def test_place_and_owner_in_an_heic_stay_out(tmp_path: Path) -> None:
     data = heic(smooth(), Heic(exif=phone_exif(5.7, 26)))
     assert b"SERIAL-4711" in data
