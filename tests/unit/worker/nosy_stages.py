@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pipelines.captures.decoders import open_picture
 from pipelines.stage import Stage, StageContext
 from pipelines.tools.ffmpeg import ffmpeg_version
 
@@ -159,6 +158,9 @@ def _work(ctx: StageContext) -> str:
     Path("~").expanduser().joinpath("cached").write_text("x")
     with tempfile.NamedTemporaryFile(dir="/dev/shm") as shared:
         shared.write(b"x")
+    # Imported where it runs: numpy's threads come and go with forks, and `_fork_bomb` counts those.
+    from pipelines.captures.decoders import open_picture
+
     for name, kind, size in (("photo.heic", "HEIF", (96, 64)), ("photo.dng", "TIFF", (96, 64))):
         with open_picture(ctx.workspace.root / name, kind) as image:
             image.load()
