@@ -44,7 +44,7 @@ _LEVEL = 0.8
 _BELOW, _MOST_BELOW = 0.03, 0.02
 """Of known points, so many may seem to lie below a floor by so much of their depth."""
 _MOST_LINES, _HYPOTHESES, _MOST_ENDS = 12, 400, 20_000
-_LEAST_PX, _LEAST_VIEWS, _LEAST_VIEW_PX, _MOST_VIEW_PX = 60, 4, 8, 60
+_LEAST_PX, _LEAST_VIEWS, _LEAST_VIEW_PX, _MOST_VIEW_PX = 60, 3, 8, 60
 _LEAST_LENGTH = 0.03
 """Of a line between two points that stand for one, relative to their depth."""
 _LEAST_SPREAD_DEG = 1.0
@@ -53,7 +53,7 @@ _SAME_DEG = 4.0
 _TOUCH_PX, _TOUCH_SHARE, _MOST_TOUCHED = 12, 0.12, 3
 _BENEATH_WEIGHT = 0.5
 _EXTRAPOLATED = 3.0
-_LEAST_AGREEING, _PER_REFUSAL = 2, 2
+_PER_REFUSAL = 2
 _LOOK_SHARE, _LAY_SHARE = 0.4, 0.7
 _MESSAGE = "standing walls up"
 
@@ -93,8 +93,8 @@ def stood_up(
 ) -> list[DepthMap]:
     """The maps with plain patches on the walls that their borders with the floor tell of.
 
-    Only unknown pixels change: they get their wall's depth where at least two neighbours agree, and
-    twice as many as see through it.
+    Only unknown pixels change: they get their wall's depth where a neighbour agrees and none sees
+    through it, or twice as many agree.
     """
     planes = find_planes(views, maps)
     points, depths = known_samples(views, maps)
@@ -127,7 +127,7 @@ def stood_up(
         filled,
         neighbours,
         config,
-        lambda agree, through: agree < np.maximum(_LEAST_AGREEING, _PER_REFUSAL * through),
+        lambda agree, through: agree < np.maximum(1, _PER_REFUSAL * through),
         lambda done: on_progress(_LAY_SHARE + (1.0 - _LAY_SHARE) * done, _MESSAGE),
     )
 
