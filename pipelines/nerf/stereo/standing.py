@@ -54,7 +54,7 @@ _TOUCH_PX, _TOUCH_SHARE, _MOST_TOUCHED = 12, 0.12, 3
 _BENEATH_WEIGHT = 0.5
 _EXTRAPOLATED = 3.0
 _PER_REFUSAL = 2
-_LOOK_SHARE, _LAY_SHARE = 0.4, 0.7
+_PLANES_SHARE, _LOOK_SHARE, _LAY_SHARE = 0.1, 0.4, 0.7
 _MESSAGE = "standing walls up"
 
 
@@ -96,7 +96,7 @@ def stood_up(
     Only unknown pixels change: they get their wall's depth where a neighbour agrees and none sees
     through it, or twice as many agree.
     """
-    planes = find_planes(views, maps)
+    planes = find_planes(views, maps, lambda done: on_progress(_PLANES_SHARE * done, _MESSAGE))
     points, depths = known_samples(views, maps)
     floors = _floors(views, planes, points, depths)
     if not floors:
@@ -104,7 +104,8 @@ def stood_up(
     looks = []
     for index, (view, found) in enumerate(zip(views, maps, strict=True)):
         looks.append(_look(view, found.z, planes))
-        on_progress(_LOOK_SHARE * (index + 1) / len(views), _MESSAGE)
+        share = (_LOOK_SHARE - _PLANES_SHARE) * (index + 1) / len(views)
+        on_progress(_PLANES_SHARE + share, _MESSAGE)
     walls = [
         wall
         for wall in _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
@@ -221,8 +222,8 @@ def _find_walls(
             places, depths, views, pieces = places[some], depths[some], views[some], pieces[some]
         normal = planes[floor, :3]
         along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-        axes = np.stack([along / np.linalg.norm(along), np.cross(normal, along)])
-        axes[1] /= np.linalg.norm(axes[1])
+        along /= np.linalg.norm(along)
+        axes = np.stack([along, np.cross(normal, along)])
         flat = places @ axes.T
         for _ in range(_MOST_LINES):
             on_line()
@@ -234,10 +235,10 @@ def _find_walls(
             seen_by = np.flatnonzero(np.bincount(views[on_it]) >= _LEAST_VIEW_PX)
             facing = line[:2] @ axes
             plane = np.append(facing, line[2])
-            direction, some = np.cross(normal, facing), places[on_it][0]
+            direction, point = np.cross(normal, facing), places[on_it][0]
             if (
                 len(seen_by) >= _LEAST_VIEWS
-                and _spread_deg(centers[seen_by] - some, direction) >= _LEAST_SPREAD_DEG
+                and _spread_deg(centers[seen_by] - point, direction) >= _LEAST_SPREAD_DEG
                 and _share_behind(centers, plane) <= _BEHIND
             ):
                 walls.append(_Wall(plane, floor))
