@@ -104,8 +104,9 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         "clips": clips_of(outcome, source),
     }
     report["subpixel"] = refinement
-    report["warnings"] = [*report["warnings"], *clip_warnings(report["clips"])]
-    for warning in clip_warnings(report["clips"]):
+    apart = clip_warnings(report["clips"])
+    report["warnings"] = [*report["warnings"], *apart]
+    for warning in apart:
         ctx.logger.warning("%s", warning["message"])
     _write_report(ctx, report)
     ctx.progress(1.0, f"{len(model.indices)} of {len(source.files)} images registered", 0.0)
