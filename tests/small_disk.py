@@ -27,11 +27,11 @@ def small_disk(num_bytes: int) -> Iterator[Path]:
             stdout=subprocess.PIPE,
         )
     except FileNotFoundError:
-        pytest.skip("no small disk can be mounted: there is no unshare")
+        pytest.skip("what a full disk does is NOT tested: there is no unshare to mount one with")
     try:
         assert holder.stdout is not None
         if holder.stdout.readline() != b"ready\n":
-            pytest.skip("no small disk can be mounted here")
+            pytest.skip("what a full disk does is NOT tested: this system lets nobody mount one")
         yield Path(f"/proc/{holder.pid}/root/mnt")
     finally:
         holder.kill()
