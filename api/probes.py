@@ -7,8 +7,6 @@ import logging
 import threading
 from collections.abc import Callable
 
-from kombu.exceptions import KombuError
-from redis.exceptions import RedisError
 from sqlalchemy.exc import SQLAlchemyError
 
 from api.problems import FieldProblem
@@ -44,7 +42,7 @@ class Probe:
         wrong = None
         try:
             self._ping()
-        except (SQLAlchemyError, StorageError, KombuError, RedisError, OSError) as error:
+        except (SQLAlchemyError, StorageError, OSError) as error:
             logger.warning("not ready: %s: %s", self.name, error)
             wrong = "does not answer"
         except Exception:

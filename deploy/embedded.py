@@ -178,6 +178,7 @@ class Embedded:
                 environment=environment,
                 log=logs / "api.log",
                 ready=lambda: answers(f"{self.url}/livez"),
+                alone=False,  # it needs no broker to answer
             )
         )
         programs.append(

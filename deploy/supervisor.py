@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 POLL_S = 0.2
+READY_POLL_S = 0.05
 FIRST_RESTART_DELAY_S = 0.2
 LONGEST_RESTART_DELAY_S = 3.0
 STEADY_AFTER_S = 20.0
@@ -40,6 +41,7 @@ class Program:
     """One process to keep running.
 
     ready: called until it returns True; start-up waits for it.
+    alone: it is started once all before it are ready; otherwise beside the one before it.
     stop_s: how long it may take to end after SIGTERM before it is killed.
     """
 
@@ -50,6 +52,7 @@ class Program:
     ready: Callable[[], bool] = lambda: True
     ready_s: float = 60.0
     stop_s: float = 10.0
+    alone: bool = True
 
 
 @dataclass
@@ -77,12 +80,16 @@ class Supervisor:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def start(self) -> None:
-        """Start all, each once the one before is ready. Raises StartFailed; then none is left."""
+        """Start all in order, as `Program.alone` says. Raises StartFailed; then none is left."""
+        coming: list[_Running] = []
         try:
             for program in self.programs:
+                if program.alone:
+                    self._wait_ready(coming)
                 running = _Running(program, _launch(program), time.monotonic())
                 self._running.append(running)
-                self._wait_ready(running)
+                coming.append(running)
+            self._wait_ready(coming)
         except BaseException:
             self.stop()
             raise
@@ -100,21 +107,25 @@ class Supervisor:
                 running = self._running.pop()
                 _end(running.process, running.program.stop_s)
 
-    def _wait_ready(self, running: _Running) -> None:
-        program = running.program
-        deadline = time.monotonic() + program.ready_s
-        while not program.ready():
-            if running.process.poll() is not None:
-                raise StartFailed(
-                    f"{program.name} ended with status {running.process.returncode} at its start:\n"
-                    + tail(program.log)
-                )
-            if time.monotonic() > deadline:
-                raise StartFailed(
-                    f"{program.name} was not ready within {program.ready_s:.0f} s:\n"
-                    + tail(program.log)
-                )
-            time.sleep(0.05)
+    def _wait_ready(self, coming: list[_Running]) -> None:
+        """Until all of them are; the list is empty then."""
+        while coming:
+            for running in [*coming]:
+                program, status = running.program, running.process.poll()
+                if program.ready():
+                    coming.remove(running)
+                elif status is not None:
+                    raise StartFailed(
+                        f"{program.name} ended with status {status} at its start:\n"
+                        + tail(program.log)
+                    )
+                elif time.monotonic() > running.started + program.ready_s:
+                    raise StartFailed(
+                        f"{program.name} was not ready within {program.ready_s:.0f} s:\n"
+                        + tail(program.log)
+                    )
+            if coming:
+                time.sleep(READY_POLL_S)
 
     def _watch(self) -> None:
         while not self._stopping.wait(POLL_S):

@@ -11,17 +11,18 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-from celery import Celery
-from kombu.exceptions import KombuError
-from redis.exceptions import RedisError
 from sqlalchemy import select, update
 
 from storage.breaker import Breaker
 from storage.db import Database, now
 from storage.models import StageRow
-from storage.queue import TASK_RUN_STAGE, queue_for
+from storage.queue import queue_for
 from storage.records import has_live_gpu
+
+if TYPE_CHECKING:
+    from storage.broker import Broker
 
 MAX_PENDING = 10_000
 BATCH = 100
@@ -38,21 +39,9 @@ class Bell:
         """timeout_s: how long the broker may take to connect, and to answer."""
         self._database = database
         self._timeout_s = timeout_s
-        self._celery = Celery("nerfworks-bell", broker=redis_url, set_as_current=False)
-        self._celery.conf.update(
-            task_serializer="json",
-            task_ignore_result=True,
-            broker_pool_limit=2,
-            broker_connection_timeout=timeout_s,
-            broker_transport_options={
-                "socket_connect_timeout": timeout_s,
-                "socket_timeout": timeout_s,
-                "socket_keepalive": True,
-                "max_retries": 1,
-                "interval_start": 0.1,
-                "interval_max": 0.2,
-            },
-        )
+        self._redis_url = redis_url
+        self._opened: Broker | None = None
+        self._opening = threading.Lock()
         self._breaker = Breaker()
         self._changed = threading.Condition()
         self._pending: dict[str, None] = {}  # in order, each id once
@@ -128,29 +117,30 @@ class Bell:
 
     def _send(self, stage_id: str, queue: str) -> bool:
         try:
-            self._celery.send_task(
-                TASK_RUN_STAGE,
-                args=[stage_id],
-                queue=queue,
-                ignore_result=True,
-                retry=True,  # once: a connection of the pool may be of a broker that is no more
-                retry_policy={"max_retries": 1, "interval_start": 0.1, "interval_step": 0.1},
-            )
-        except (KombuError, RedisError, OSError) as error:
+            self._broker().send(stage_id, queue)
+        except OSError as error:
             pause_s = self._breaker.failed()
             _log.warning(
                 "the broker took no message (%s): the bell is silent for %.0f s",
-                type(error).__name__,
+                error,
                 pause_s,
             )
             return False
         self._breaker.succeeded()
         return True
 
+    def _broker(self) -> Broker:
+        """Opened when first asked for, by a thread that may wait: that imports Celery."""
+        with self._opening:
+            if self._opened is None:
+                from storage.broker import Broker
+
+                self._opened = Broker(self._redis_url, self._timeout_s)
+            return self._opened
+
     def ping(self) -> None:
-        """Raise an error (KombuError, RedisError or OSError) where the broker does not answer."""
-        with self._celery.connection_for_write() as connection:
-            connection.ensure_connection(max_retries=1, interval_start=0.1, timeout=self._timeout_s)
+        """Raises `storage.broker.BrokerError`, an OSError, where the broker does not answer."""
+        self._broker().ping()
 
     def close(self) -> None:
         """Stop ringing: what is not sent by now, workers find by themselves."""
@@ -159,4 +149,5 @@ class Bell:
             self._changed.notify_all()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
-        self._celery.close()
+        if self._opened is not None:
+            self._opened.close()

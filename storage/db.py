@@ -41,7 +41,6 @@ from sqlalchemy.engine import Connection
 from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
-from storage.postgres import bound
 from storage.steps import reached
 from storage.tenants import keep_to, watch
 from storage.turns import Turns
@@ -152,6 +151,11 @@ def first_and_now(session: Session, query: Select[Any]) -> tuple[Any, datetime] 
     return None if both is None else (both[0], both[1])
 
 
+def is_locked(error: DBAPIError) -> bool:
+    """Whether PostgreSQL refused a statement because another has a row locked."""
+    return getattr(error.orig, "sqlstate", None) == "55P03"
+
+
 def is_full(error: DBAPIError) -> bool:
     """Whether a statement was refused because the disk of the database is full."""
     if isinstance(error.orig, sqlite3.Error):
@@ -230,6 +234,8 @@ def make_engine(url: str, deadline_s: float = STATEMENT_S) -> Engine:
         return engine
     if parsed.drivername != "postgresql+psycopg":
         raise ValueError(f"no database of kind {parsed.drivername}: use sqlite or postgresql")
+    from storage.postgres import bound  # its driver takes a while to import
+
     engine = create_engine(parsed, pool_size=5, max_overflow=15, pool_timeout=POOL_S)
     bound(engine, deadline_s)
     return engine

@@ -22,10 +22,9 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from storage.claims import Claim
-from storage.db import name_actor, now
+from storage.db import is_locked, name_actor, now
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
 from storage.models import Job, StageRow, StageRun
-from storage.postgres import is_locked
 from storage.runs import RunEnd, count_checkpoint, count_ends, run_of
 from storage.transitions import fail_for_good, lock_job, set_stage, settle
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import psycopg
 from psycopg import sql
 from sqlalchemy import Engine, event
-from sqlalchemy.exc import DBAPIError, InvalidatePoolError
+from sqlalchemy.exc import InvalidatePoolError
 
 Result = TypeVar("Result")
 
@@ -80,11 +80,6 @@ class BoundedConnection(psycopg.Connection[Any]):
         except StopIteration as end:
             result: Result = end.value
             return result
-
-
-def is_locked(error: DBAPIError) -> bool:
-    """Whether the database refused a statement because another has a row locked."""
-    return getattr(error.orig, "sqlstate", None) == "55P03"
 
 
 def bound(engine: Engine, deadline_s: float) -> None:

@@ -55,7 +55,7 @@ def lock_job(session: Session, job_id: str, *, nowait: bool = False) -> tuple[Jo
 
     Stages before the job: so does a claim, which begins with one stage. Others may still add rows
     that name the job (events, log lines). nowait: with an OperationalError where another has one of
-    them locked (`storage.postgres.is_locked`).
+    them locked (`storage.db.is_locked`).
     """
     fresh = {"populate_existing": True}
     stages = session.scalars(

@@ -222,6 +222,18 @@ def test_callers_need_only_what_their_install_brings() -> None:
     assert "--preset" in shown.stdout
 
 
+def test_the_api_answers_before_it_imports_what_its_first_answers_do_not_need() -> None:
+    late = ("celery", "kombu", "redis", "psycopg", "boto3", "torch", "numpy", "pycolmap", "open3d")
+    program = (
+        "import sys, api.app, deploy.embedded\n"
+        f"print([name for name in {late!r} if name in sys.modules])\n"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", program], check=False, capture_output=True, text=True, cwd=ROOT
+    )
+    assert (shown.stdout, shown.stderr) == ("[]\n", "")
+
+
 def test_nerf_imports_nothing_but_its_few_libraries() -> None:
     wrong = []
     for path in files_of("pipelines/nerf"):
