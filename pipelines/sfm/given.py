@@ -23,15 +23,15 @@ from pipelines.errors import Cancelled, PipelineError
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.orientation import opengl_from_opencv
 from pipelines.sfm.agreement import LITTLE
+from pipelines.sfm.given_depth import Beside
 from pipelines.sfm.given_fit import Fit, fit_of
 from pipelines.sfm.given_pairs import overlapping_pairs, sampled_pairs
 from pipelines.sfm.given_refinement import Refined, refine
+from pipelines.sfm.given_scale import Scale, scaled, weighed
 from pipelines.sfm.pairs import Pairs
 from pipelines.sfm.tracks import Floats, build_tracks
 from pipelines.tools.colmap import CameraGroup, FeatureSettings, Reconstructor
 
-DepthRatio = tuple[float, float]
-"""See `pipelines.sfm.given_depth.depth_ratio`."""
 Mode = Literal["auto", "trust", "refine"]
 Verdict = Literal["trusted", "refined", "kept", "unverified"]
 
@@ -70,11 +70,13 @@ class OutOfTime(Exception):
 
 @dataclass(frozen=True)
 class Posed:
-    """The images of a capture with given poses: N names, lenses, poses [N, 3, 4], OpenCV axes."""
+    """The images of a capture with given poses: N names, lenses, poses [N, 3, 4], OpenCV axes.
+    is_metric: whether they are in metres."""
 
     files: tuple[str, ...]
     lenses: tuple[Intrinsics, ...]
     poses: Floats
+    is_metric: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ class Judged:
     before: Fit | None = None
     after: Fit | None = None
     refined: Refined | None = None
-    depths: tuple[DepthRatio, DepthRatio] | None = None
+    depths: tuple[Beside, Beside] | None = None
+    scale: Scale | None = None
     reading: str | None = None
     seconds: float = 0.0
 
@@ -110,8 +113,8 @@ class Judge:
     """Judges and refines the given poses of one capture.
 
     settings: of features. progress: receives the share that is done and a message; what it raises
-    ends all. logger: receives what breaks off. depth_ratio: of refined or given points, see
-    `pipelines.sfm.given_depth`.
+    ends all. logger: receives what breaks off. beside: refined or given points beside measured
+    depth, see `pipelines.sfm.given_depth`.
     """
 
     def __init__(
@@ -120,7 +123,7 @@ class Judge:
         reconstructor: Reconstructor,
         settings: FeatureSettings,
         progress: Callable[[float, str], None],
-        depth_ratio: Callable[[Refined], DepthRatio | None],
+        beside: Callable[[Refined], Beside | None],
         *,
         upsample: Literal["auto", "on", "off"],
         num_threads: int,
@@ -131,7 +134,7 @@ class Judge:
         self._reconstructor = reconstructor
         self._settings = settings
         self._progress = progress
-        self._depth_ratio = depth_ratio
+        self._beside = beside
         self._upsample = upsample
         self._num_threads = num_threads
         self._seed = seed
@@ -233,22 +236,32 @@ class Judge:
             report=say,
         )
         after = fit_of(refined.poses, posed.lenses, held, long_side_px)
-        judged = replace(judged, before=before, after=after, refined=refined)
-        if refined.before is not None:
-            was, now = self._depth_ratio(refined.before), self._depth_ratio(refined)
-            if was is not None and now is not None:
-                judged = replace(judged, depths=(was, now))
+        judged = self._measured(replace(judged, before=before, after=after, refined=refined))
         against = self._objection(judged)
         if against is not None:
             return replace(judged, verdict="kept", why=f"{judged.why}; {against}")
         assert after is not None
+        assert judged.refined is not None
         return replace(
             judged,
             verdict="refined",
-            poses=refined.poses,
+            poses=judged.refined.poses,
             why=f"matches that were set aside miss the given poses by {before.error_px:.2f} px, "
             f"the refined ones by {after.error_px:.2f}",
         )
+
+    def _measured(self, judged: Judged) -> Judged:
+        """Refined poses at the scale that path and sensor say, and points beside the sensor's."""
+        refined = judged.refined
+        assert refined is not None
+        now = self._beside(refined)
+        if self._posed.is_metric:
+            scale = weighed(self._posed.poses, refined, now)
+            middle = self._posed.poses[:, :, 3].mean(axis=0)
+            judged = replace(judged, scale=scale, refined=scaled(refined, scale.factor, middle))
+            now = now and replace(now, ratio=now.ratio * scale.factor)
+        was = None if refined.before is None else self._beside(refined.before)
+        return judged if was is None or now is None else replace(judged, depths=(was, now))
 
     def _objection(self, judged: Judged) -> str | None:
         """What speaks against the refined poses, or None."""
@@ -270,13 +283,14 @@ class Judge:
                 f"refined ones are {np.median(turned):.1f} degrees and {far:.0%} of the scene away"
             )
         if judged.depths is not None:
-            (scale, spread), (new_scale, new_spread) = judged.depths
-            if abs(np.log(new_scale)) > abs(np.log(scale)) + MOST_SCALED:
-                return f"refined ones are {new_scale:.3f} times the measured depth, not {scale:.3f}"
-            if new_spread > MOST_SPREAD * spread:
+            was, now = judged.depths
+            if abs(np.log(now.ratio)) > abs(np.log(was.ratio)) + MOST_SCALED:
+                ratios = f"{now.ratio:.3f} times the measured depth, not {was.ratio:.3f}"
+                return f"refined ones are {ratios}"
+            if now.spread > MOST_SPREAD * was.spread:
                 return (
-                    f"refined ones agree less with the measured depth, within {new_spread:.1%} "
-                    f"instead of {spread:.1%}"
+                    f"refined ones agree less with the measured depth, within {now.spread:.1%} "
+                    f"instead of {was.spread:.1%}"
                 )
         return None
 

@@ -1,49 +1,113 @@
 """Points of matched features beside the depth that a sensor measured: its scale, and how well both
-agree."""
+agree.
+
+Only places count where both can be right: where the sensor sees one surface (at the edges of things
+it mixes the near and the far one into depths that nothing has), and where pictures see a point from
+directions that tell how far away it is.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from pipelines.scene.cameras_file import Intrinsics
-from pipelines.scene.sensor_depth import load_sensor_depth
+from pipelines.scene.sensor_depth import Depths, load_sensor_depth
 from pipelines.sfm.given_refinement import Refined
+from pipelines.sfm.tracks import Floats, apart_deg
 
-_FEWEST = 100
+FEWEST = 100
 """Places compared, for the result to mean anything."""
+FEWEST_IMAGES = 5
+_OF_IMAGE = 5
+_ONE_SURFACE = 0.05
+"""By how much depths of a pixel and its eight neighbours may differ, as a share, where they are
+taken for one surface's: one that is seen from 70 degrees aside changes by less from pixel to pixel
+of 256 across."""
+_APART_DEG = 0.75
 
 
-def depth_ratio(
+@dataclass(frozen=True)
+class Beside:
+    """Points beside measured depth.
+
+    ratio: how many times as far away as measured points are, the median. spread: the median
+    deviation from that, as a share. depth: of the places, median, world units. num_images: in which
+    such places are.
+    """
+
+    ratio: float
+    spread: float
+    depth: float
+    num_places: int
+    num_images: int
+
+
+def points_beside(
     found: Refined, lenses: Sequence[Intrinsics], depths: Sequence[Path | None]
-) -> tuple[float, float] | None:
-    """How many times as far away as measured points are, the median, and the median deviation from
-    that, as a share; None where too few places have both.
+) -> Beside | None:
+    """What the sensor says of points; None where too few places have both.
 
     depths: N, the maps of `pipelines.scene.sensor_depth`; those that cannot be read count as none.
     """
-    logs = []
+    apart = apart_deg(found.seen, found.points, found.poses)
+    logs, away, num_images = [], [], 0
     for image, path in enumerate(depths):
         mine = np.flatnonzero(found.seen.image == image)
+        mine = mine[apart[found.seen.track[mine]] >= _APART_DEG]
         if path is None or not len(mine):
             continue
         try:
-            measured = load_sensor_depth(path)
+            measured = one_surface(load_sensor_depth(path))
         except ValueError:
             continue
         pose, lens = found.poses[image], lenses[image]
-        away = found.points[found.seen.track[mine]] - pose[:, 3]
-        z = away @ pose[:, 2]
+        z = (found.points[found.seen.track[mine]] - pose[:, 3]) @ pose[:, 2]
         height, width = measured.shape
-        cells = (found.seen.xy[mine] * (width / lens.width, height / lens.height)).astype(np.int64)
-        column, row = np.clip(cells, 0, (width - 1, height - 1)).T
-        there = measured[row, column]
+        there = between(measured, found.seen.xy[mine] * (width / lens.width, height / lens.height))
         known = (there > 0) & (z > 0)
         logs.append(np.log(z[known] / there[known]))
+        away.append(there[known])
+        num_images += int(known.sum() >= _OF_IMAGE)
     ratios = np.concatenate(logs) if logs else np.zeros(0)
-    if len(ratios) < _FEWEST:
+    if len(ratios) < FEWEST or num_images < FEWEST_IMAGES:
         return None
     middle = float(np.median(ratios))
-    return float(np.exp(middle)), float(np.median(np.abs(ratios - middle)))
+    return Beside(
+        ratio=float(np.exp(middle)),
+        spread=float(np.median(np.abs(ratios - middle))),
+        depth=float(np.median(np.concatenate(away))),
+        num_places=len(ratios),
+        num_images=num_images,
+    )
+
+
+def one_surface(z: Depths) -> Depths:
+    """The depths [h, w] that all eight neighbours share, as far as one surface may slope; 0 of
+    others, of those without a neighbour that is known, and at the border."""
+    far = maximum_filter(z, 3, mode="constant", cval=0.0)
+    near = minimum_filter(z, 3, mode="constant", cval=0.0)
+    return np.where((near > 0) & (far <= (1.0 + _ONE_SURFACE) * near), z, np.float32(0.0))
+
+
+def between(z: Depths, xy: Floats) -> Floats:
+    """Depths [K] at places xy [K, 2] of the map, pixel centres at halves, interpolated between the
+    four pixels around; 0 where one of them is not known. Inverse depths are interpolated, which
+    are linear in the picture of a plane."""
+    height, width = z.shape
+    with np.errstate(divide="ignore"):
+        inverse = np.where(z > 0, 1.0 / z.astype(np.float64), np.nan)
+    x, y = (xy - 0.5).T
+    left = np.clip(np.floor(x).astype(np.int64), 0, max(width - 2, 0))
+    top = np.clip(np.floor(y).astype(np.int64), 0, max(height - 2, 0))
+    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    u, v = np.clip(x - left, 0.0, 1.0), np.clip(y - top, 0.0, 1.0)
+    mixed = (1 - v) * ((1 - u) * inverse[top, left] + u * inverse[top, right]) + v * (
+        (1 - u) * inverse[below, left] + u * inverse[below, right]
+    )
+    found: Floats = np.where(np.isfinite(mixed) & (mixed > 0), 1.0 / mixed, 0.0)
+    return found

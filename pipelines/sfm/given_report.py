@@ -9,6 +9,7 @@ import numpy as np
 from pipelines.sfm.agreement import LITTLE
 from pipelines.sfm.given import Judged, Posed, movement, suspects
 from pipelines.sfm.given_fit import Fit
+from pipelines.sfm.given_scale import Scale
 
 DOUBTFUL_PX = 3.0
 """Median miss from which the report warns."""
@@ -43,9 +44,10 @@ def given_report(judged: Judged, posed: Posed, long_side_px: int) -> dict[str, A
             "sensor_depth": None
             if judged.depths is None
             else {
-                name: {"ratio": _round(ratio), "spread": _round(spread)}
-                for name, (ratio, spread) in zip(("before", "after"), judged.depths, strict=True)
+                name: {"ratio": _round(beside.ratio), "spread": _round(beside.spread)}
+                for name, beside in zip(("before", "after"), judged.depths, strict=True)
             },
+            "scale": None if judged.scale is None else judged.scale.as_dict(),
         }
     return found
 
@@ -70,8 +72,9 @@ def given_warnings(judged: Judged, posed: Posed) -> list[dict[str, Any]]:
     wrong = suspects(fit)
     if fit.agreement < LITTLE or wrong:
         return [_contradicted(judged, fit, [posed.files[index] for index in wrong])]
+    warnings = [] if judged.scale is None else _of_scale(judged.scale)
     if fit.error_px > DOUBTFUL_PX:
-        return [
+        warnings.append(
             {
                 "code": "given_poses_coarse",
                 "message": f"The capture's poses fit its pictures only coarsely: {judged.why}.",
@@ -79,8 +82,23 @@ def given_warnings(judged: Judged, posed: Posed) -> list[dict[str, Any]]:
                 "no worse, or send the pictures alone to have their poses found.",
                 "details": {"error_px": round(fit.error_px, 3)},
             }
-        ]
-    return []
+        )
+    return warnings
+
+
+def _of_scale(scale: Scale) -> list[dict[str, Any]]:
+    if not scale.is_contradicted or scale.by_sensor is None:
+        return []
+    return [
+        {
+            "code": "given_scale_contradicted",
+            "message": f"By the depth that came with the capture all lengths are "
+            f"{scale.by_sensor:.4g} times what its camera poses say. The poses were believed.",
+            "hint": "Measure something whose length you know, and scale what you export by that; a "
+            "factor of about 1000 or 0.001 means that the depth was written in another unit.",
+            "details": scale.as_dict(),
+        }
+    ]
 
 
 def _contradicted(judged: Judged, fit: Fit, files: list[str]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from pipelines.scene.orientation import opengl_from_opencv
 from pipelines.sfm.attempts import num_processors
 from pipelines.sfm.given import Judge, Judged, Posed
 from pipelines.sfm.given_colors import colors_of
-from pipelines.sfm.given_depth import depth_ratio
+from pipelines.sfm.given_depth import Beside, points_beside
 from pipelines.sfm.given_refinement import Refined
 from pipelines.sfm.given_report import given_report, given_warnings
 from pipelines.sfm.tracks import Floats, apart_deg
@@ -54,6 +54,7 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         poses=opengl_from_opencv(
             np.array([image.world_from_camera for image in cameras.images]).reshape(-1, 3, 4)
         ),
+        is_metric=cameras.metric,
     )
     depths = [None if image.depth is None else root / image.depth for image in cameras.images]
     with tempfile.TemporaryDirectory(prefix="poses-") as scratch:
@@ -65,8 +66,8 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             seed=ctx.seed,
         )
 
-        def measured(found: Refined) -> tuple[float, float] | None:
-            return depth_ratio(found, posed.lenses, depths)
+        def measured(found: Refined) -> Beside | None:
+            return points_beside(found, posed.lenses, depths)
 
         judge = Judge(
             posed,

@@ -66,6 +66,15 @@ class Case:
 def drifted(truth: CamerasFile) -> CamerasFile:
     """The same cameras as an app would have them: off by a little, smoothly along the way, but at
     the scale of the true ones as a whole, since nothing in pictures tells a wrong one."""
+    return _off(truth, keeps_scale=True)
+
+
+def shrunk(truth: CamerasFile) -> CamerasFile:
+    """The same drift as it comes: it makes this path smaller by more than 1 %."""
+    return _off(truth, keeps_scale=False)
+
+
+def _off(truth: CamerasFile, *, keeps_scale: bool) -> CamerasFile:
     true = np.array([pose_matrix(image) for image in truth.images])
     poses = true.copy()
     along = np.linspace(0.0, 2 * np.pi, len(poses))
@@ -74,7 +83,7 @@ def drifted(truth: CamerasFile) -> CamerasFile:
     poses[:, :, :3] = turns @ poses[:, :, :3]
     poses[:, :, 3] += DRIFT * path_extent(poses[:, :, 3]) * waves
     middle = poses[:, :, 3].mean(axis=0)
-    scale = similarity(poses[:, :, 3], true[:, :, 3]).scale
+    scale = similarity(poses[:, :, 3], true[:, :, 3]).scale if keeps_scale else 1.0
     poses[:, :, 3] = middle + scale * (poses[:, :, 3] - middle)
     images = tuple(
         replace(image, world_from_camera=tuple(tuple(map(float, row)) for row in pose))
@@ -126,6 +135,12 @@ def _polycam(path: Path) -> CamerasFile:
     )
 
 
+def _polycam_shrunk(path: Path) -> CamerasFile:
+    return capture_writers.write_polycam(
+        path, NUM_APP_FRAMES, APP_PX, corrected=False, given=shrunk
+    )
+
+
 def _record3d(path: Path) -> CamerasFile:
     return capture_writers.write_record3d(path, NUM_APP_FRAMES, APP_PX, depth=True, given=drifted)
 
@@ -145,6 +160,7 @@ _CASES = (
     Case("sample-360", ".mp4", _panorama, is_plain=False),
     Case("room-360", ".mp4", _room_panorama, is_plain=False),
     Case("polycam", ".zip", _polycam, by_time=False, metric=True, is_plain=False),
+    Case("polycam-shrunk", ".zip", _polycam_shrunk, by_time=False, metric=True, is_plain=False),
     Case("record3d", ".zip", _record3d, by_time=False, metric=True, is_plain=False),
     Case("scanner-app", ".zip", _scanner_app, by_time=False, metric=True, is_plain=False),
 )

@@ -17,7 +17,7 @@ from tests.benchmarks.pose_accuracy import (
     row_of,
     rungs_of,
 )
-from tests.benchmarks.pose_captures import CASES, DRIFT, DRIFT_DEG, drifted
+from tests.benchmarks.pose_captures import CASES, DRIFT, DRIFT_DEG, drifted, shrunk
 
 TRUTH = walk(12)
 POSES = np.array([pose_matrix(image) for image in TRUTH.images])
@@ -53,6 +53,11 @@ def test_drifted_poses_are_off_by_what_is_said() -> None:
     assert 0.3 * DRIFT < np.median(away) < 2 * DRIFT
     assert 0.3 * DRIFT_DEG < np.median(turned) < 2 * DRIFT_DEG
     assert np.abs(np.linalg.det(found[:, :, :3]) - 1).max() < 1e-9
+
+
+def test_the_same_drift_as_it_comes_makes_the_path_smaller() -> None:
+    found = np.array([pose_matrix(image) for image in shrunk(TRUTH).images])
+    assert similarity(found[:, :, 3], POSES[:, :, 3]).scale > 1.01
 
 
 @pytest.mark.parametrize(
@@ -94,6 +99,7 @@ def test_the_error_of_given_poses_is_what_matches_miss_those_by_that_were_taken(
 def test_metric_cases_are_those_that_come_with_poses() -> None:
     assert {case.name for case in CASES.values() if case.metric} == {
         "polycam",
+        "polycam-shrunk",
         "record3d",
         "scanner-app",
     }

@@ -17,6 +17,7 @@ from pipelines.sample.align import path_extent, similarity
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.scene.sensor_depth import save_sensor_depth
 from pipelines.sfm import given
+from pipelines.sfm.given_depth import Beside
 from pipelines.stage import StageContext
 from pipelines.stages.poses import run
 from pipelines.tools.colmap import Reconstructor
@@ -48,9 +49,16 @@ def drifted(centers: float = 0.015, turns_deg: float = 1.0) -> Poses:
 
 
 def context(
-    root: Path, poses: Poses, pictures: list[Image.Image], *, depth: float = 0.0, **more: Any
+    root: Path,
+    poses: Poses,
+    pictures: list[Image.Image],
+    *,
+    depth: float = 0.0,
+    metric: bool = True,
+    **more: Any,
 ) -> StageContext:
-    """A capture as `ingest` leaves it. depth: with a sensor's depth, of that scale."""
+    """A capture as `ingest` leaves it. depth: with a sensor's depth, of that scale. metric: whether
+    its poses are in metres."""
     folder = Workspace(root).stage("ingest")
     (folder / "images").mkdir(parents=True)
     (folder / "depth").mkdir()
@@ -65,7 +73,7 @@ def context(
             )
         rows = tuple(tuple(float(value) for value in row) for row in pose)
         images.append(PosedImage(file, 0, rows, depth=depth_file if depth else None))
-    CamerasFile((lens,), tuple(images), metric=True, source="nerfstudio").save(
+    CamerasFile((lens,), tuple(images), metric=metric, source="nerfstudio").save(
         folder / "cameras.json"
     )
     out = root / ".partial" / "poses"
@@ -142,15 +150,41 @@ def test_drifted_poses_are_refined_towards_the_truth_at_their_own_place_and_scal
     # In the frame that they came in: no more off than drift moves the whole.
     apart = np.linalg.norm(found(ctx)[:, :, 3] - TRUTH[:, :, 3], axis=1)
     assert apart.mean() < np.linalg.norm(poses[:, :, 3] - TRUTH[:, :, 3], axis=1).mean()
-    assert abs(similarity(found(ctx)[:, :, 3], poses[:, :, 3]).scale - 1) < 0.01
+    assert abs(similarity(found(ctx)[:, :, 3], poses[:, :, 3]).scale - 1) < 0.03
     depth = told["refinement"]["sensor_depth"]
-    assert abs(depth["after"]["ratio"] - depth["before"]["ratio"]) < given.MOST_SCALED
+    assert abs(depth["after"]["ratio"] - 1.0) < 0.005
     assert depth["after"]["spread"] < 0.3 * depth["before"]["spread"]
+    # Drift made the path 2.4 % longer; the sensor knows better, and is heard.
+    assert abs(similarity(TRUTH[:, :, 3], found(ctx)[:, :, 3]).scale - 1) < 0.005
+    assert told["refinement"]["scale"]["believed"] == "path and sensor"
     assert told["refinement"]["num_carried"] == 0
     assert told["refinement"]["replaced"] == []
     assert steps == sorted(steps)
     assert len(set(steps)) > 10
     assert (ctx.out / "points.ply").is_file()
+
+
+@pytest.mark.parametrize(
+    ("depth", "metric", "codes_told"),
+    [(1000.0, True, ["given_scale_contradicted"]), (0.0, True, []), (1.0, False, [])],
+    ids=["millimetres", "no sensor", "no unit"],
+)
+def test_drifted_poses_keep_their_scale_where_no_sensor_tells_a_better_one(
+    tmp_path: Path,
+    pictures: list[Image.Image],
+    depth: float,
+    metric: bool,
+    codes_told: list[str],
+) -> None:
+    poses = drifted()[:FEW]
+    ctx = context(tmp_path, poses, pictures[:FEW], depth=depth, metric=metric)
+    summary = run(OPTIONS, ctx)
+    assert summary["given"]["verdict"] == "refined"
+    assert codes(summary) == codes_told
+    spread = [np.linalg.norm(all_[:, :, 3] - all_[:, :, 3].mean(0)) for all_ in (found(ctx), poses)]
+    assert spread[0] / spread[1] == pytest.approx(1.0, abs=0.005)
+    scale = summary["given"]["refinement"]["scale"]
+    assert scale is None if not metric else scale["believed"] == "path"
 
 
 def test_a_picture_that_shows_nothing_goes_with_its_neighbours(
@@ -229,7 +263,7 @@ def test_pictures_without_matches_leave_the_poses_and_say_so(tmp_path: Path) -> 
 def test_depth_that_the_refined_poses_contradict_keeps_the_given_ones(
     tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.stages.given_poses.depth_ratio", _worse_when_refined())
+    monkeypatch.setattr("pipelines.stages.given_poses.points_beside", _worse_when_refined())
     ctx = context(tmp_path, drifted()[:FEW], pictures[:FEW])
     told = run(OPTIONS, ctx)["given"]
     assert told["verdict"] == "kept"
@@ -238,7 +272,7 @@ def test_depth_that_the_refined_poses_contradict_keeps_the_given_ones(
 
 
 def _worse_when_refined() -> Any:
-    return lambda found, *_: (1.0, 0.01) if found.before is None else (1.05, 0.01)
+    return lambda found, *_: Beside(1.0 if found.before is None else 1.2, 0.01, 2.0, 500, NUM)
 
 
 @pytest.mark.parametrize(
