@@ -24,7 +24,6 @@ from storage.jobs import stage_id
 from storage.leases import heartbeat, reap_expired, save_checkpoint, succeed_stage
 from storage.models import StageRow
 from storage.postgres import FRESH_S
-from storage.schema import upgrade
 from storage.transitions import lock_job
 from tests.factories import make_job
 from tests.faults import at_step
@@ -48,15 +47,6 @@ OPERATIONS: dict[str, Callable[[Session, Claim], Any]] = {
         session, claim, manifest={"files": []}, output_prefix="prefix/"
     ),
 }
-
-
-@pytest.fixture
-def database(postgres_url: str) -> Iterator[Database]:
-    """The way to PostgreSQL that is never cut off."""
-    upgrade(postgres_url)
-    made = Database(postgres_url)
-    yield made
-    made.dispose()
 
 
 @pytest.fixture

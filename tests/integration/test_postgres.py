@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,20 +19,11 @@ from storage.leases import cancel_stage, reap_expired, succeed_stage
 from storage.models import LogLine
 from storage.queries import get_job, list_jobs
 from storage.records import append_logs, delete_capture, get_capture, read_logs
-from storage.schema import upgrade
 from tests.factories import make_capture, make_job, states
 from tests.integration.engine import Engine
 from tests.services import RedisServer, S3Endpoint
 
 pytestmark = pytest.mark.services
-
-
-@pytest.fixture
-def database(postgres_url: str) -> Iterator[Database]:
-    upgrade(postgres_url)
-    made = Database(postgres_url)
-    yield made
-    made.dispose()
 
 
 def test_one_of_many_claims_at_once_wins(database: Database) -> None:
