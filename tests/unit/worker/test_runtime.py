@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import select
 
 from deploy.embedded import free_port
 from storage.claims import claim_stage
@@ -34,6 +35,10 @@ from worker.runtime import WorkerIdentity, WorkerRuntime
 from worker.settings import WorkerSettings
 
 TOYS = "tests.integration.toy_stages"
+PATIENT = "tests.integration.patient_stages"
+ENDS = ("succeeded", "failed")
+LONG_S = 180.0
+"""Far longer than anything here takes: a loaded machine must not decide a test."""
 SECOND = {"steps": 10, "step_s": 0.15}
 
 
@@ -45,11 +50,14 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 @contextmanager
-def workers(engine: Engine, *identities: WorkerIdentity) -> Iterator[list[WorkerRuntime]]:
+def workers(
+    engine: Engine, *identities: WorkerIdentity, registry: str = TOYS
+) -> Iterator[list[WorkerRuntime]]:
     """Workers in this process. Nobody rings: their housekeeping finds what is ready."""
     settings = WorkerSettings(tick_s=0.1, direct_after_s=0.0, ring_again_s=600.0, clean_s=600.0)
     made = [
-        WorkerRuntime(identity, engine.settings, settings, registry=TOYS) for identity in identities
+        WorkerRuntime(identity, engine.settings, settings, registry=registry)
+        for identity in identities
     ]
     for runtime in made:
         runtime.start()
@@ -71,45 +79,72 @@ def overlap(one: StageRow, other: StageRow) -> bool:
     return max(a, c) < min(b, d)
 
 
-def submit_two(engine: Engine) -> tuple[str, str]:
-    """Two jobs; the frames of the second take until the training of the first is half done."""
-    longer = {**SECOND, "steps": 15}
-    return (
-        engine.submit({"frames": SECOND, "train": SECOND}, ring=False),
-        engine.submit({"frames": longer, "train": SECOND}, ring=False),
-    )
+class Gates:
+    """Files that toy stages wait for before they end, so that no test waits for a clock."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._folder = engine.witness.parent  # which a contained stage can read
+
+    def plan(self, name: str) -> dict[str, str]:
+        """Of a stage that ends once the gate of that name is open."""
+        return {"until": str(self._folder / name)}
+
+    def open(self, name: str) -> None:
+        (self._folder / name).touch()
 
 
-def check_overlap(engine: Engine, first: str, second: str) -> None:
-    for job in (first, second):
-        assert engine.wait_for(job, "succeeded", "failed").state == "succeeded"
+def wait_until_running(engine: Engine, *stages: tuple[str, str]) -> None:
+    """Until stages, (job, name), run at one moment."""
+
+    def states() -> set[str]:
+        with engine.database.read_scope() as session:  # one transaction: one moment
+            found = {row.id: row.state for row in session.scalars(select(StageRow))}
+        return {found[stage_id(job, name)] for job, name in stages}
+
+    engine.wait(lambda: states() == {"running"}, LONG_S)
+
+
+def check_overlap(engine: Engine, *identities: WorkerIdentity) -> None:
+    """One job trains while the frames of the next are made; the GPU is for one training."""
+    gates = Gates(engine)
+    first = engine.submit({"train": gates.plan("trained")}, ring=False)
+    second = engine.submit({"frames": gates.plan("framed")}, ring=False)
+    with workers(engine, *identities):
+        wait_until_running(engine, (first, "train"), (second, "frames"))
+        gates.open("framed")
+        engine.wait(lambda: engine.stage(second, "train").state != "blocked", LONG_S)
+        # What comes later is taken and done: who took it has passed over the second training.
+        third = engine.submit({}, skip=("train", "mesh", "video"), ring=False)
+        assert engine.wait_for(third, *ENDS, timeout_s=LONG_S).state == "succeeded"
+        assert engine.stage(first, "train").state == "running"
+        assert engine.stage(second, "train").state == "ready"
+        gates.open("trained")
+        for job in (first, second):
+            assert engine.wait_for(job, *ENDS, timeout_s=LONG_S).state == "succeeded"
     assert overlap(engine.stage(first, "train"), engine.stage(second, "frames"))
     assert not overlap(engine.stage(first, "train"), engine.stage(second, "train"))
 
 
 def test_a_gpu_worker_trains_one_job_while_a_cpu_worker_prepares_the_next(engine: Engine) -> None:
-    first, second = submit_two(engine)
     gpu = WorkerIdentity("gpu", 1, ("gpu",), True)
-    cpu = WorkerIdentity("cpu", 1, ("cpu", "light"), False)
-    with workers(engine, gpu, cpu):
-        check_overlap(engine, first, second)
+    check_overlap(engine, gpu, WorkerIdentity("cpu", 1, ("cpu", "light"), False))
 
 
 def test_two_slots_beside_one_gpu_do_the_same_and_share_the_gpu_with_nobody(
     engine: Engine,
 ) -> None:
-    first, second = submit_two(engine)
-    with workers(engine, WorkerIdentity("both", 2, ("cpu", "gpu", "light"), True)):
-        check_overlap(engine, first, second)
+    check_overlap(engine, WorkerIdentity("both", 2, ("cpu", "gpu", "light"), True))
 
 
 def test_stages_of_one_job_that_wait_for_the_same_run_side_by_side_in_two_slots(
     engine: Engine,
 ) -> None:
-    job = engine.submit({"mesh": SECOND, "video": SECOND}, ring=False)
-    with workers(engine, WorkerIdentity("w", 2, ("cpu", "light"), False)):
-        assert engine.wait_for(job, "succeeded", "failed").state == "succeeded"
-    assert overlap(engine.stage(job, "mesh"), engine.stage(job, "video"))
+    gates = Gates(engine)
+    job = engine.submit({"mesh": gates.plan("both"), "video": gates.plan("both")}, ring=False)
+    with workers(engine, WorkerIdentity("w", 2, ("cpu", "light"), False), registry=PATIENT):
+        wait_until_running(engine, (job, "mesh"), (job, "video"))
+        gates.open("both")
+        assert engine.wait_for(job, *ENDS, timeout_s=LONG_S).state == "succeeded"
 
 
 def test_what_holds_a_workers_stages_in_is_on_record(engine: Engine) -> None:
