@@ -229,7 +229,7 @@ def run_case(case: Case, way: str, seed: int, given: argparse.Namespace) -> Judg
     """Write the capture, find its poses unless that is done, and compare them."""
     capture, truth = written(case, given.out / "captures")
     job = Workspace((given.out / f"{case.name}-{given.preset}-{seed}").resolve())
-    _put(capture, job, seed)
+    put_capture(capture, job, seed)
     kind = sniff(job.capture_file, capture.name).kind
     if way == SUBPIXEL:
         other = Workspace(job.root.with_name(f"{job.root.name}-{way}"))
@@ -247,7 +247,7 @@ def run_case(case: Case, way: str, seed: int, given: argparse.Namespace) -> Judg
     return judge(case, way, seed, job, truth, Seconds(wall.get("frames", 0.0), wall["poses"]))
 
 
-def _put(capture: Path, job: Workspace, seed: int) -> None:
+def put_capture(capture: Path, job: Workspace, seed: int) -> None:
     """The capture where a job expects it."""
     job.capture_file.parent.mkdir(parents=True, exist_ok=True)
     if not job.capture_file.exists():

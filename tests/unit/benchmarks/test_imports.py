@@ -26,6 +26,7 @@ OF_THE_WHOLE_PRODUCT = (
     "mesh_memory.py",
     "pose_accuracy.py",
     "pose_captures.py",
+    "poses_both_ways.py",
     "poses_speed.py",
     "poses_ways.py",
     "scene_capture.py",
