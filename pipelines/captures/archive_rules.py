@@ -1,4 +1,5 @@
-"""What a zip archive must be like before anything in it is used. Standard library only.
+"""What an archive must be like before anything in it is used: a zip, or a tar, which is looked at
+as if it were one (`pipelines.captures.tar_files`). Standard library only.
 
 An entry's name is only ever looked up, never made into a path of ours; yet an archive with a
 hostile name is refused as a whole, since nobody sends one by accident. Headers can lie about
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from pipelines.captures.magic import HEAD_BYTES, is_zip
+from pipelines.captures.tar_files import TarArchive, is_tar
 from pipelines.errors import CaptureError
 
 _READ_ERRORS = (
@@ -43,6 +45,9 @@ _COPY_BYTES = 1 << 20
 _JUNK_NAMES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 
 
+Archive = zipfile.ZipFile | TarArchive
+
+
 @dataclass(frozen=True)
 class ArchiveLimits:
     """How large an archive may be.
@@ -63,6 +68,10 @@ def _unsafe(message: str) -> CaptureError:
         code="archive_unsafe",
         hint="Make the archive again from the plain folder, with an ordinary zip program.",
     )
+
+
+def _too_large(message: str) -> CaptureError:
+    return _bomb(message, "Send an archive of fewer pictures, and of nothing else.")
 
 
 def _bomb(message: str, hint: str) -> CaptureError:
@@ -139,7 +148,7 @@ def _check_sizes(entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> N
         )
 
 
-def _check_overlap(archive: zipfile.ZipFile, entries: Sequence[zipfile.ZipInfo]) -> None:
+def _check_overlap(archive: Archive, entries: Sequence[zipfile.ZipInfo]) -> None:
     """No two entries share bytes: a bomb can otherwise pack one payload under many names."""
     ordered = sorted(entries, key=lambda info: info.header_offset)
     starts = [*(info.header_offset for info in ordered), archive.start_dir][1:]
@@ -224,16 +233,44 @@ class _Archive(zipfile.ZipFile):
         self._reads.close()
 
 
-def open_archive(path: Path, limits: ArchiveLimits | None = None) -> zipfile.ZipFile:
-    """Open a zip for reading; of what is in it only the length of its list was checked.
+def open_archive(path: Path, limits: ArchiveLimits | None = None) -> Archive:
+    """Open an archive for reading; of what is in it only the length of its list was checked.
 
     Raises CaptureError: archive_damaged, archive_bomb.
     """
+    limits = limits or ArchiveLimits()
     with reading():
-        return _Archive(path, limits or ArchiveLimits())
+        if not is_tar(path):
+            return _Archive(path, limits)
+        return TarArchive(
+            path,
+            max_entries=limits.max_entries,
+            max_list_bytes=limits.max_directory_bytes,
+            max_bytes=limits.max_unpacked_bytes,
+            bomb=_too_large,
+        )
 
 
-def checked_entries(archive: zipfile.ZipFile, limits: ArchiveLimits) -> dict[str, zipfile.ZipInfo]:
+def is_archive(path: Path, head: bytes) -> bool:
+    """Whether a file that begins like that is an archive that `open_archive` opens."""
+    return is_zip(head) or is_tar(path)
+
+
+def checksum_of(archive: Archive, info: zipfile.ZipInfo) -> int:
+    """The CRC-32 of an entry: what a zip declares; in a tar it is counted.
+
+    Raises CaptureError archive_damaged.
+    """
+    if isinstance(archive, zipfile.ZipFile):
+        return info.CRC
+    found = 0
+    with reading(), archive.open(info) as source:
+        while chunk := source.read(_COPY_BYTES):
+            found = zlib.crc32(chunk, found)
+    return found
+
+
+def checked_entries(archive: Archive, limits: ArchiveLimits) -> dict[str, zipfile.ZipInfo]:
     """The archive's files by name, litter and folders left out, once all of it was checked.
 
     Raises CaptureError: archive_unsafe, archive_bomb, archive_encrypted.
@@ -255,7 +292,7 @@ def checked_entries(archive: zipfile.ZipFile, limits: ArchiveLimits) -> dict[str
     }
 
 
-def head_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+def head_of(archive: Archive, info: zipfile.ZipInfo) -> bytes:
     """The first bytes of an entry. Raises CaptureError where it is a zip itself, or damaged."""
     with reading(), archive.open(info) as file:
         head = file.read(HEAD_BYTES)
@@ -264,7 +301,7 @@ def head_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     return head
 
 
-def copy_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path) -> None:
+def copy_entry(archive: Archive, info: zipfile.ZipInfo, target: Path) -> None:
     """Write one entry to `target`. Raises CaptureError: archive_damaged, also where it holds more
     or less than it declares."""
     with reading(), archive.open(info) as source, target.open("wb") as sink:

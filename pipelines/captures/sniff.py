@@ -18,6 +18,7 @@ from pipelines.captures.archive_rules import (
     checked_entries,
     copy_entry,
     head_of,
+    is_archive,
     open_archive,
 )
 from pipelines.captures.catalogue import claimed
@@ -26,14 +27,13 @@ from pipelines.captures.magic import (
     HEAD_BYTES,
     foreign_image,
     image_format,
-    is_zip,
     video_container,
 )
 from pipelines.errors import CaptureError
 
 _ACCEPTED = (
     "Send a video (MP4, MOV, MKV, WebM, AVI), a .zip of photos (JPEG, HEIC, raw) or of several "
-    "videos, or a .zip of an app export."
+    "videos, or a .zip of an app export; .tar and .tar.gz do as well."
 )
 
 
@@ -62,8 +62,8 @@ def sniff(path: Path, filename: str, limits: ArchiveLimits | None = None) -> Sni
         raise CaptureError(
             "The file is empty.", code="empty_file", hint="Check the file and send it again."
         )
-    if is_zip(head):
-        return _sniff_zip(path, limits or ArchiveLimits())
+    if is_archive(path, head):
+        return _sniff_archive(path, limits or ArchiveLimits())
     found = claimed(Listing({"": head}, is_archive=False))
     if found is None:
         raise _unknown(head, filename)
@@ -81,7 +81,7 @@ def _unknown(head: bytes, filename: str) -> CaptureError:
         )
     if head.startswith((b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b")) or head[:3] == b"BZh":
         return CaptureError(
-            "The file is an archive, but not a zip.",
+            "The file is packed, but neither a zip nor a .tar or .tar.gz.",
             code="unknown_type",
             hint="Pack the photos as .zip and send that.",
         )
@@ -100,7 +100,7 @@ def _unknown(head: bytes, filename: str) -> CaptureError:
     )
 
 
-def _sniff_zip(path: Path, limits: ArchiveLimits) -> Sniffed:
+def _sniff_archive(path: Path, limits: ArchiveLimits) -> Sniffed:
     with open_archive(path, limits) as archive:
         entries = checked_entries(archive, limits)
         heads = {name: head_of(archive, info) for name, info in entries.items()}

@@ -19,6 +19,7 @@ from typing import IO, Any
 from pipelines.captures.archive_rules import (
     ArchiveLimits,
     checked_entries,
+    checksum_of,
     damaged,
     head_of,
     open_archive,
@@ -35,7 +36,7 @@ MAX_JSON_PARTS = 10_000_000
 
 
 class CaptureArchive:
-    """A zip archive, open for reading, as a context. Names are those of its files, with "/".
+    """An archive, open for reading, as a context. Names are those of its files, with "/".
 
     Raises CaptureError as `archive_rules.checked_entries` does, and archive_damaged.
     """
@@ -46,13 +47,15 @@ class CaptureArchive:
         self._counted: dict[str, int] = {}
         self._used: set[str] = set()
         self._set_aside: dict[str, str] = {}
-        self._zip = open_archive(path)
+        self._archive = open_archive(path, limits)
         try:
-            self._entries = checked_entries(self._zip, limits)
-            self._heads = {name: head_of(self._zip, info) for name, info in self._entries.items()}
+            self._entries = checked_entries(self._archive, limits)
+            self._heads = {
+                name: head_of(self._archive, info) for name, info in self._entries.items()
+            }
             self._formats = {name: image_format(head) for name, head in self._heads.items()}
         except BaseException:
-            self._zip.close()
+            self._archive.close()
             raise
 
     def __enter__(self) -> CaptureArchive:
@@ -64,7 +67,7 @@ class CaptureArchive:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._zip.close()
+        self._archive.close()
 
     @property
     def names(self) -> frozenset[str]:
@@ -88,8 +91,8 @@ class CaptureArchive:
         return self._entries[name].file_size
 
     def checksum(self, name: str) -> int:
-        """The CRC-32 of an entry, as the archive declares it."""
-        return self._entries[name].CRC
+        """The CRC-32 of an entry, as a zip declares it. Raises CaptureError archive_damaged."""
+        return checksum_of(self._archive, self._entries[name])
 
     def head(self, name: str) -> bytes:
         """The first bytes of an entry, `magic.HEAD_BYTES` at most."""
@@ -125,7 +128,7 @@ class CaptureArchive:
         info = self._entries[name]
         written = 0
         with reading():
-            source = self._zip.open(info)
+            source = self._archive.open(info)
         with source, target.open("wb") as sink:
             while chunk := self._chunk(source):
                 written += len(chunk)
@@ -137,7 +140,7 @@ class CaptureArchive:
     def peek(self, name: str, max_bytes: int) -> bytes:
         """An entry's first bytes, only to look at: it does not count as used. Raises as `read`."""
         info = self._entries[name]
-        with reading(), self._zip.open(info) as source:
+        with reading(), self._archive.open(info) as source:
             data = source.read(max_bytes)
         self._count(len(data), info)
         return data
