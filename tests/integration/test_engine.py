@@ -139,6 +139,7 @@ def test_cancel_kills_a_deaf_stage_within_ten_seconds_with_all_it_started(engine
 
 
 def test_a_stage_over_its_time_limit_fails(engine: Engine) -> None:
+    engine.environment["NERFWORKS_REGISTRY"] = "tests.integration.hasty_stages"
     engine.start_worker()
     job = engine.wait_for(
         engine.submit({"mesh": {"steps": 600, "step_s": 0.1}}), "succeeded", "failed"
@@ -245,12 +246,17 @@ def test_a_frozen_worker_loses_its_stage_to_another_in_the_same_home(
     )
     try:
         first = engine.start_worker("w1")
-        job_id = engine.submit({"train": {"steps": 50, "step_s": 0.1, "save_every": 5}})
+        gate = tmp_path / "go on"
+        steps = {"steps": 50, "step_s": 0.1, "save_every": 5, "until": str(gate)}
+        job_id = engine.submit({"train": steps})
         engine.wait(lambda: engine.stage(job_id, "train").checkpoint_prefix)
+        stage_pid = int(engine.notes("train start")[0].split()[-1])
         first.send_signal(signal.SIGSTOP)
         engine.start_worker("w2")
         engine.wait(lambda: len(engine.notes("train start")) == 2)
+        engine.wait(lambda: not is_running(stage_pid))
         first.send_signal(signal.SIGCONT)
+        gate.touch()
         job = engine.wait_for(job_id, "succeeded", "failed")
         assert job.state == "succeeded", job.error
         assert engine.outcomes(job_id, "train") == ["lost", "succeeded"]

@@ -25,7 +25,6 @@ def engine(
 ) -> Iterator[Engine]:
     """On PostgreSQL and S3, which two machines can share."""
     parts = {**s3_endpoint.environment(), "NERFWORKS_DATABASE_URL": postgres_url}
-    parts["NERFWORKS_REGISTRY"] = "tests.integration.patient_stages"
     made = Engine(tmp_path, redis_server.url, **parts)
     yield made
     made.close()

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from storage.leases import owner_name
 from storage.models import Capture, Job, StageRow
 from storage.queries import list_events
 from storage.records import live_workers, register_worker
+from tests.integration import toy_stages
 from tests.integration.engine import Engine, is_running
 from worker.__main__ import MANY_CORES, default_slots, parse_arguments
 from worker.pulse import Pulse
@@ -35,7 +37,6 @@ from worker.runtime import WorkerIdentity, WorkerRuntime
 from worker.settings import WorkerSettings
 
 TOYS = "tests.integration.toy_stages"
-PATIENT = "tests.integration.patient_stages"
 ENDS = ("succeeded", "failed")
 LONG_S = 180.0
 """Far longer than anything here takes: a loaded machine must not decide a test."""
@@ -50,14 +51,11 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 @contextmanager
-def workers(
-    engine: Engine, *identities: WorkerIdentity, registry: str = TOYS
-) -> Iterator[list[WorkerRuntime]]:
+def workers(engine: Engine, *identities: WorkerIdentity) -> Iterator[list[WorkerRuntime]]:
     """Workers in this process. Nobody rings: their housekeeping finds what is ready."""
     settings = WorkerSettings(tick_s=0.1, direct_after_s=0.0, ring_again_s=600.0, clean_s=600.0)
     made = [
-        WorkerRuntime(identity, engine.settings, settings, registry=registry)
-        for identity in identities
+        WorkerRuntime(identity, engine.settings, settings, registry=TOYS) for identity in identities
     ]
     for runtime in made:
         runtime.start()
@@ -141,7 +139,7 @@ def test_stages_of_one_job_that_wait_for_the_same_run_side_by_side_in_two_slots(
 ) -> None:
     gates = Gates(engine)
     job = engine.submit({"mesh": gates.plan("both"), "video": gates.plan("both")}, ring=False)
-    with workers(engine, WorkerIdentity("w", 2, ("cpu", "light"), False), registry=PATIENT):
+    with workers(engine, WorkerIdentity("w", 2, ("cpu", "light"), False)):
         wait_until_running(engine, (job, "mesh"), (job, "video"))
         gates.open("both")
         assert engine.wait_for(job, *ENDS, timeout_s=LONG_S).state == "succeeded"
@@ -301,12 +299,25 @@ def test_a_worker_whose_place_was_taken_while_it_slept_goes_on_under_another_id(
 
 
 @pytest.mark.parametrize(
-    ("times", "at", "ends"), [(1, 1.0, "succeeded"), (2, 0.1, "failed")], ids=["flood", "drip"]
+    ("times", "at", "stall_s", "ends"),
+    [(1, 1.0, 10.0, "succeeded"), (2, 0.1, 1.5, "failed")],
+    ids=["flood", "drip"],
 )
 def test_a_stage_that_hangs_is_ended_once_and_then_fails_the_job(
-    engine: Engine, times: int, at: float, ends: str
+    engine: Engine,
+    monkeypatch: pytest.MonkeyPatch,
+    times: int,
+    at: float,
+    stall_s: float,
+    ends: str,
 ) -> None:
-    """It is alive and reports, always the same; what is done is told without a pause between."""
+    """It is alive and reports, always the same; what is done is told without a pause between.
+
+    Who is to succeed has the time that a new process takes to start.
+    """
+    video = replace(toy_stages.get_stage("video"), stall_s=stall_s)
+    stages = (video if stage.name == "video" else stage for stage in toy_stages.STAGES)
+    monkeypatch.setattr(toy_stages, "STAGES", tuple(stages))
     job = engine.submit({"video": {"hang_times": times, "hang_at": at}}, ring=False)
     with workers(engine, WorkerIdentity("w", 1, ("cpu", "light"), False)):
         assert engine.wait_for(job, "succeeded", "failed").state == ends
