@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.sensor_depth import save_sensor_depth
-from pipelines.sfm.given_depth import between, one_surface, points_beside
+from pipelines.sfm.given_depth import Beside, between, one_surface, points_beside
 from pipelines.sfm.given_refinement import Refined, onto
 from pipelines.sfm.given_scale import Scale, path_uncertainty, scaled, sensor_uncertainty, weighed
 from pipelines.sfm.tracks import Observations
@@ -221,6 +221,30 @@ def test_what_a_path_is_uncertain_by_is_what_drift_does_to_its_scale() -> None:
     assert 0.5 < np.sqrt(np.mean(np.square(parts))) < 1.5
 
 
+def test_path_and_sensor_together_err_less_than_either_alone() -> None:
+    random = np.random.default_rng(9)
+    by_path: list[float] = []
+    by_sensor: list[float] = []
+    by_both: list[float] = []
+    for _ in range(300):
+        given = TRUTH.copy()
+        steps = np.cumsum(random.normal(size=(NUM, 3)), axis=0) / np.sqrt(NUM)
+        given[:, :, 3] += random.uniform(0.001, 0.015) * EXTENT * steps
+        refined = found(places(4), given)
+        path = float(np.linalg.norm(np.ptp(refined.poses[:, :, 3], axis=0))) / EXTENT
+        sensor = float(np.exp(0.007 * random.normal()))
+        scale = weighed(given, refined, Beside(path / sensor, 0.01, 2.0, 900, NUM))
+        for errors, length in (
+            (by_path, path),
+            (by_sensor, sensor),
+            (by_both, path * scale.factor),
+        ):
+            errors.append(float(np.log(length)))
+    spread = [np.sqrt(np.mean(np.square(errors))) for errors in (by_path, by_sensor, by_both)]
+    assert spread[2] < 0.9 * min(spread[:2])
+    assert np.mean(np.abs(by_both) > 0.01) < 0.5 * np.mean(np.abs(by_path) > 0.01)
+
+
 def test_a_row_mixed_up_says_nothing_of_the_path() -> None:
     given = drifted(0.02)
     plain = path_uncertainty(given, TRUTH, np.ones(NUM, bool))
@@ -233,7 +257,7 @@ def test_a_row_mixed_up_says_nothing_of_the_path() -> None:
 def test_a_sensor_close_by_is_less_certain(tmp_path: Path) -> None:
     beside = points_beside(found(places()), [LENS] * NUM, maps(tmp_path))
     assert beside is not None
-    close = type(beside)(1.0, beside.spread, 0.3, beside.num_places, beside.num_images)
+    close = Beside(1.0, beside.spread, 0.3, beside.num_places, beside.num_images)
     assert sensor_uncertainty(close) > 2 * sensor_uncertainty(beside)
 
 
