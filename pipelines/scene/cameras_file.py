@@ -53,6 +53,8 @@ class PosedImage:
     depth: path of the depth that a sensor measured (`pipelines.scene.sensor_depth`): npz with `z`,
         float32 [h, w], world units along the camera's axis, 0 = unknown. It covers the image at a
         resolution of its own, lens distortion included. Or None.
+    light: how brightly it was taken, where pictures were levelled: gains of red, green and blue
+        over the capture's mean light, and the camera's bend (`pipelines.nerf.data.light`). Or None.
     """
 
     file: str
@@ -62,6 +64,7 @@ class PosedImage:
     split: str | None = None
     mask: str | None = None
     depth: str | None = None
+    light: tuple[float, float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,12 @@ class CamerasFile:
     metric: bool = False
     source: str = ""
     notes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def bend(self) -> float | None:
+        """Of the camera's curve, where training brought the pictures to one light; else None."""
+        bends = [image.light[3] for image in self.images if image.light is not None]
+        return bends[0] if bends else None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain JSON, for files that hold more than cameras; `from_dict` is its inverse."""
@@ -88,6 +97,7 @@ class CamerasFile:
                 **{
                     **image,
                     "world_from_camera": tuple(tuple(row) for row in image["world_from_camera"]),
+                    "light": tuple(image["light"]) if image.get("light") else None,
                 }
             )
             for image in raw["images"]
@@ -98,6 +108,8 @@ class CamerasFile:
                 raise ValueError(f"{image.file}: world_from_camera is not 3x4")
             if not all(math.isfinite(value) for row in pose for value in row):
                 raise ValueError(f"{image.file}: world_from_camera is not finite")
+            if image.light is not None and not _is_light(image.light):
+                raise ValueError(f"{image.file}: light is not three gains and a bend")
             if not 0 <= image.camera < len(cameras):
                 raise ValueError(f"{image.file}: camera {image.camera} does not exist")
         return cls(
@@ -125,3 +137,11 @@ class CamerasFile:
         if raw.get("version") != FORMAT_VERSION:
             raise ValueError(f"cameras.json has version {raw.get('version')}, not {FORMAT_VERSION}")
         return cls.from_dict(raw)
+
+
+def _is_light(values: tuple[float, ...]) -> bool:
+    return (
+        len(values) == 4
+        and all(0.0 < gain < math.inf for gain in values[:3])
+        and 0.0 <= values[3] <= 1.0
+    )

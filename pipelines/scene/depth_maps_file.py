@@ -7,14 +7,16 @@ undistorted cameras in the images' places, in the world frame; depth is along th
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.data.light import Light
 from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.depth_views import Pinhole
 
 INDEX = "maps.json"
@@ -23,10 +25,13 @@ _FOLDER = "maps"
 
 @dataclass(frozen=True)
 class MappedImage:
-    """An image that has a map. file: as in `cameras.json`. lens: of the map."""
+    """An image that has a map. file: as in `cameras.json`. lens: of the map. light: of the image,
+    where its capture's light drifts.
+    """
 
     file: str
     lens: Pinhole
+    light: Light | None = None
 
 
 class DepthMapsWriter:
@@ -37,18 +42,21 @@ class DepthMapsWriter:
         (folder / _FOLDER).mkdir(parents=True, exist_ok=True)
         self._images: list[MappedImage] = []
 
-    def append(self, file: str, lens: Pinhole, found: DepthMap) -> None:
+    def append(self, file: str, lens: Pinhole, found: DepthMap, light: Light | None = None) -> None:
         """The map of one more image. Half precision, relative to the map's median: 0.05 %."""
         known = found.z > 0
         unit = float(np.median(found.z[known])) if known.any() else 1.0
         path = self._folder / _FOLDER / f"{len(self._images):06d}.npz"
         relative = (found.z / np.float32(unit)).astype(np.float16)
         np.savez_compressed(path, z=relative, unit=np.float64(unit), votes=found.votes)
-        self._images.append(MappedImage(file, lens))
+        self._images.append(MappedImage(file, lens, light))
 
     def close(self, *, measured: bool = False) -> None:
         """Write the index. measured: whether a sensor had a part in the maps."""
-        rows = [{"file": item.file, "lens": asdict(item.lens)} for item in self._images]
+        rows = [
+            {"file": item.file, "lens": asdict(item.lens), "light": item.light}
+            for item in self._images
+        ]
         index = {"measured": measured, "images": rows}
         (self._folder / INDEX).write_text(json.dumps(index, indent=1), "utf-8")
 
@@ -65,13 +73,19 @@ class DepthMapsFile:
             index = json.loads((folder / INDEX).read_text("utf-8"))
             self.measured = bool(index["measured"])
             self.images = [
-                MappedImage(row["file"], Pinhole(**row["lens"])) for row in index["images"]
+                MappedImage(row["file"], Pinhole(**row["lens"]), _light(row.get("light")))
+                for row in index["images"]
             ]
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{folder / INDEX} is no list of depth maps: {error}") from error
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def lit(self, images: Sequence[PosedImage]) -> list[PosedImage]:
+        """The images with their light."""
+        lights = {item.file: item.light for item in self.images}
+        return [replace(image, light=lights.get(image.file)) for image in images]
 
     def read(self, index: int) -> DepthMap:
         """The map of `images[index]`."""
@@ -82,3 +96,10 @@ class DepthMapsFile:
     def __iter__(self) -> Iterator[tuple[MappedImage, DepthMap]]:
         for index, image in enumerate(self.images):
             yield image, self.read(index)
+
+
+def _light(values: Sequence[float] | None) -> Light | None:
+    if values is None:
+        return None
+    red, green, blue, bend = (float(value) for value in values)
+    return red, green, blue, bend

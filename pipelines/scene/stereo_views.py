@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipelines.nerf.data.light import levelled
 from pipelines.nerf.space.lenses import CAMERA_MODELS, distort
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
@@ -44,11 +46,15 @@ def stereo_view(root: Path, image: PosedImage, lens: Intrinsics, long_side_px: i
 def undistorted_picture(
     root: Path, image: PosedImage, lens: Intrinsics, pinhole: Pinhole
 ) -> NDArray[np.uint8]:
-    """An image of a capture in colour, as that pinhole sees it, [H, W, 3]; black beyond it."""
+    """An image of a capture in colour, as that pinhole sees it, [H, W, 3]; black beyond it.
+
+    In the mean light, where the image has a light.
+    """
     size = (pinhole.width, pinhole.height)
     with Image.open(root / image.file) as opened:
         opened.draft("RGB", size)
-        picture = np.asarray(opened.convert("RGB").resize(size, Image.Resampling.BOX), np.float32)
+        stored = np.asarray(opened.convert("RGB").resize(size, Image.Resampling.BOX))
+    picture = levelled(stored, image.light).astype(np.float32)
     channels = [_undistorted(picture[..., channel], lens, pinhole) for channel in range(3)]
     shown: NDArray[np.uint8] = np.rint(np.clip(np.stack(channels, axis=-1), 0, 255)).astype(
         np.uint8
@@ -99,6 +105,7 @@ def _terms(lens: Intrinsics) -> tuple[float, ...]:
     return (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2)
 
 
+@lru_cache(maxsize=1)  # most captures have one lens: its polynomial is solved once for all images
 def _image_pixels(
     lens: Intrinsics, pinhole: Pinhole
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -118,6 +118,11 @@ class TrainedScene:
         cameras = _cameras_of(loaded.extras)
         return cls(model, loaded.scene, cameras, loaded.extras, render_config, memory_share)
 
+    @property
+    def bend(self) -> float | None:
+        """Of the camera's curve, where pictures were brought to one light; else None."""
+        return self.cameras.bend
+
     def training_images(self, at_most: int = 0) -> list[PosedImage]:
         """The images that were trained on, in the file's order; or so many, evenly picked."""
         return self._images("train", at_most)

@@ -10,7 +10,7 @@ none. Nothing is rendered from the model, no GPU is used.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from pipelines.judging.depth_scores import (
 )
 from pipelines.judging.geometry_gate import Limits, geometry_warning
 from pipelines.nerf.data.images import ImageData, load_images
+from pipelines.nerf.data.light import in_the_light_of
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.options import AssessOptions
@@ -62,6 +63,7 @@ class Views:
     """What assets are compared with: N photos at the size asked for, and their cameras.
 
     cameras: in `frame`, the world less its origin. held_out: whether training never saw them.
+    bend: of the camera's curve, where assets have the mean light, which each photo differs from.
     """
 
     posed: list[PosedImage]
@@ -69,6 +71,7 @@ class Views:
     cameras: Cameras
     frame: SceneTransform
     held_out: bool
+    bend: float | None = None
 
     def photo(self, index: int) -> NDArray[np.float32]:
         """[H, W, 3] in [0, 1]."""
@@ -79,6 +82,16 @@ class Views:
         """[H, W], or None where all of it counts."""
         mask = self.images.mask(index)
         return None if mask is None else mask.numpy()
+
+    def lit(self, view: AssetView, index: int) -> AssetView:
+        """A view of an asset in the light of the photo."""
+        if self.bend is None:
+            return view
+        valid = self.valid(index)
+        usable = view.hit if valid is None else view.hit & valid
+        return replace(
+            view, color=in_the_light_of(view.color, self.photo(index), usable, self.bend)
+        )
 
 
 def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
@@ -148,7 +161,7 @@ def load_views(workspace: Workspace, options: AssessOptions) -> Views:
         )
         lenses = [cameras.cameras[image.camera] for image in posed]
         sized = nerf_cameras(lenses, poses, frame).resized(options.long_side_px)
-    return Views(posed, images, sized, frame, bool(held_out))
+    return Views(posed, images, sized, frame, bool(held_out), cameras.bend)
 
 
 def describe(views: Views) -> dict[str, Any]:
@@ -165,6 +178,7 @@ def describe(views: Views) -> dict[str, Any]:
         "width": width,
         "height": height,
         "note": note,
+        "light": "as it is" if views.bend is None else "halves",
     }
 
 
@@ -191,7 +205,8 @@ def _look_at_mesh(
     shown = set(evenly(len(views.posed), options.num_pictures)) if options.num_pictures else set()
     seen = _Seen([], [])
     for index, image in enumerate(views.posed):
-        view, photo = caster.view(views.cameras, index, _SAMPLES), views.photo(index)
+        view = views.lit(caster.view(views.cameras, index, _SAMPLES), index)
+        photo = views.photo(index)
         seen.views.append(view)
         seen.rows.append(score_view(view, photo, views.valid(index)))
         if index in shown:
@@ -212,7 +227,7 @@ def _look_at_cloud(
     spacing = point_spacing(points)
     rows = []
     for index in range(len(views.posed)):
-        view = cloud_view(points, colors, spacing, views.cameras, index)
+        view = views.lit(cloud_view(points, colors, spacing, views.cameras, index), index)
         rows.append(score_view(view, views.photo(index), views.valid(index)))
         ctx.progress(0.6 + 0.35 * (index + 1) / len(views.posed), "looking at the cloud")
     return rows, round(float(np.median(spacing)), 6)

@@ -2,9 +2,9 @@
 
 Reads `cameras.json` of `poses` or `ingest`, the images beside it, the depth that the capture
 brings, and the points of structure from motion where there are any. Writes a depth map for each
-image that will be trained on, agreed upon by its neighbours (`maps.json`, `maps/`), and `depth.jpg`
-to look at. Held-out images take no part, nor does their depth: what they judge must not be made
-from them.
+image that will be trained on, agreed upon by its neighbours, and how brightly it was taken where
+that drifts (`maps.json`, `maps/`), and `depth.jpg` to look at. Held-out images take no part, nor
+does their depth: what they judge must not be made from them.
 """
 
 from __future__ import annotations
@@ -22,10 +22,13 @@ from pipelines.errors import TrainingError
 from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.shades import depth_picture, depth_range
 from pipelines.nerf.data.images import split_indices
+from pipelines.nerf.data.light import Light
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, config_from_dict
+from pipelines.nerf.stereo.light import find_light
 from pipelines.nerf.stereo.maps import DepthMap, Progress, find_depth_maps, surface_points
+from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.planes import completed
 from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_scale
 from pipelines.nerf.stereo.standing import stood_up
@@ -35,11 +38,12 @@ from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.natural_order import natural_key
-from pipelines.scene.stereo_views import sensor_depth, stereo_view
+from pipelines.scene.stereo_views import sensor_depth, stereo_view, undistorted_picture
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 
-_LOAD_SHARE, _STEREO_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.73, 0.1, 0.1
+_LOAD_SHARE, _STEREO_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.72, 0.1, 0.1
+_LIGHT_SHARE = 0.03
 _PICTURE_VIEWS = 6
 
 
@@ -95,9 +99,10 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     if config.standing_walls:
         summary["before_walls_share"] = round(_known_share(maps), 4)
         maps = stood_up(views, maps, config, on_standing)
-    for image, view, found in zip(images, views, maps, strict=True):
+    lights, summary["light"] = _light(ctx, capture, images, views, maps, config)
+    for image, view, found, light in zip(images, views, maps, lights, strict=True):
         ctx.check_cancelled()
-        writer.append(image.file, _pinhole(view), found)
+        writer.append(image.file, _pinhole(view), found, light)
     writer.close(measured=with_sensor)
     _save_picture(ctx.out / "depth.jpg", views, maps)
     summary |= _described(maps)
@@ -137,6 +142,45 @@ def _with_sensor(
     measured = sensor_maps(views, sensed, config)
     both = zip(stereo, measured, strict=True)
     return [merged(a, b) for a, b in both], told
+
+
+def _light(
+    ctx: StageContext,
+    capture: CamerasFile,
+    images: list[PosedImage],
+    views: list[StereoView],
+    maps: list[DepthMap],
+    config: StereoConfig,
+) -> tuple[list[Light | None], dict[str, Any] | None]:
+    """The light of each picture, None of each where they stay as they are; and what was found."""
+    nothing: list[Light | None] = [None] * len(images)
+    if config.level_light == "off":
+        return nothing, None
+    ctx.progress(1.0 - _LIGHT_SHARE, "comparing the pictures' light")
+    depths = [found.z for found in maps]
+    points = surface_points(views, depths)
+    if len(points) == 0:
+        return nothing, None
+    pictures = [
+        undistorted_picture(
+            ctx.workspace.images_root, image, capture.cameras[image.camera], _pinhole(view)
+        )
+        for image, view in zip(images, views, strict=True)
+    ]
+    neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
+    light = find_light(views, depths, pictures, neighbours)
+    level = config.level_light == "on" or light.is_drifting
+    told = {
+        "levelled": level,
+        "drift": round(light.drift, 4),
+        "contradiction": round(light.contradiction, 4),
+        "largest_ratio": round(float((light.gains.max(axis=0) / light.gains.min(axis=0)).max()), 3),
+        "bend": light.bend,
+        "num_pairs": light.num_pairs,
+    }
+    if level:
+        ctx.logger.info("the pictures are brought to one light: %s", told)
+    return [light.of(index) for index in range(len(images))] if level else nothing, told
 
 
 def training_images(ctx: StageContext, split: SplitConfig) -> tuple[CamerasFile, list[PosedImage]]:

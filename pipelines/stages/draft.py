@@ -98,7 +98,7 @@ def _views(
     ctx: StageContext,
 ) -> ViewStore:
     """The maps with the photos' colours, as depth views on disk."""
-    named = {image.file: image for image in cameras.images}
+    named = {image.file: image for image in maps.lit(cameras.images)}
     store = ViewStore(folder)
     picked = evenly(len(maps), options.num_views or len(maps))
     for done, index in enumerate(picked, start=1):
@@ -120,7 +120,7 @@ def _painted(
     ctx: StageContext,
 ) -> TriangleMesh | TexturedMesh:
     """The mesh painted with the photos that took part."""
-    named = {image.file: image for image in cameras.images}
+    named = {image.file: image for image in maps.lit(cameras.images)}
     picked = evenly(len(maps), options.num_views or len(maps))
     images = [named[maps.images[index].file] for index in picked]
     lenses = [cameras.cameras[image.camera] for image in images]

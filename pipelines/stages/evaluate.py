@@ -3,8 +3,9 @@
 Reads `train/model.zip` and the images with their masks. Held-out views are rendered at the size
 that was trained on, with the capture's poses and the mean appearance code, or, where the options
 ask for it, with what the test-time procedure fitted (`pipelines.nerf.judging.test_time`); pixels
-that a mask leaves out are not measured. `protocol` says which of this was done. Writes
-`metrics.json` and `images/<name>.jpg`: truth | render | error.
+that a mask leaves out are not measured. Where the capture's light drifts and training levelled it,
+each half of a picture has the light that the other half was measured to have. `protocol` says which
+of this was done. Writes `metrics.json` and `images/<name>.jpg`: truth | render | error.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from pipelines.errors import ExportError
 from pipelines.nerf.data.images import ImageData, load_images
+from pipelines.nerf.data.light import in_the_light_of
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.judging.floaters import floater_measures, opacity_of_density
 from pipelines.nerf.judging.lpips import Lpips, lpips_if_configured
@@ -142,7 +144,9 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         **summarise(rows),
         "lpips_reason": no_lpips,
         "lpips_backbone": None if lpips is None else lpips.backbone,
-        "protocol": protocol(scene.extras["train"], config, has_codes(scene)),
+        "protocol": protocol(
+            scene.extras["train"], config, has_codes(scene), levelled=scene.bend is not None
+        ),
         "floaters": floaters,
         "floaters_reason": no_floaters,
     }
@@ -247,6 +251,9 @@ def _measure_view(
     code = None if fits.codes is None else fits.codes.codes[index]
     rendered = scene.render(scene.lens_of(image), pose, views.long_side, appearance=code)
     shown = torch.as_tensor(rendered.rgb).detach().cpu().float().clamp(0.0, 1.0)
+    if scene.bend is not None:
+        usable = np.ones(truth.shape[:2], np.bool_) if valid is None else valid.numpy()
+        shown = torch.from_numpy(in_the_light_of(shown.numpy(), truth.numpy(), usable, scene.bend))
     picture = side_by_side(truth.numpy(), shown.numpy())
     Image.fromarray(picture).save(out / "images" / f"{picture_name(image.file)}.jpg", quality=90)
     row: dict[str, Any] = {"file": image.file, **measure(shown, truth, valid, lpips)}

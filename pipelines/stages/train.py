@@ -144,9 +144,11 @@ def _load(config: TrainConfig, ctx: StageContext) -> _Inputs:
         )
     train_indices, test_indices = split_indices(len(ordered), config.data)
     held_out = set(test_indices)
+    maps = _held_maps(ctx)
+    lit = ordered if maps is None else maps.lit(ordered)
     marked = tuple(
         replace(image, split="test" if index in held_out else "train")
-        for index, image in enumerate(ordered)
+        for index, image in enumerate(lit)
     )
     capture = replace(given, images=marked)
     poses = np.asarray([image.world_from_camera for image in marked], np.float64)
@@ -158,20 +160,25 @@ def _load(config: TrainConfig, ctx: StageContext) -> _Inputs:
         [_inside(root, image.file) for image in marked],
         config.data.long_side_px,
         [None if image.mask is None else _inside(root, image.mask) for image in marked],
+        lights=[image.light for image in marked],
         max_bytes=int(config.data.max_memory_gib * 2**30),
     )
-    depth = _depth_maps([marked[index].file for index in train_indices], scene, config, ctx)
+    depth = _depth_maps(maps, [marked[index].file for index in train_indices], scene, config)
     return _Inputs(capture, cameras, images, train_indices, test_indices, scene, depth)
 
 
-def _depth_maps(
-    files: list[str], scene: SceneTransform, config: TrainConfig, ctx: StageContext
-) -> DepthMaps | None:
-    """The maps of the stage `depth`, of the images that are trained on, or None without any."""
-    if config.depth.weight == 0.0 or not ctx.workspace.is_complete("depth"):
+def _held_maps(ctx: StageContext) -> DepthMapsFile | None:
+    """What the stage `depth` left, if it ran."""
+    if not ctx.workspace.is_complete("depth"):
         return None
-    held = DepthMapsFile(ctx.workspace.stage("depth"))
-    if len(held) == 0:
+    return DepthMapsFile(ctx.workspace.stage("depth"))
+
+
+def _depth_maps(
+    held: DepthMapsFile | None, files: list[str], scene: SceneTransform, config: TrainConfig
+) -> DepthMaps | None:
+    """The maps of the images that are trained on, or None without any."""
+    if held is None or config.depth.weight == 0.0 or len(held) == 0:
         return None
     if [image.file for image in held.images] != files:
         raise TrainingError(

@@ -18,6 +18,7 @@ from scipy.sparse.linalg import cg
 
 from pipelines.exports.texture.charts import Charts
 from pipelines.exports.texture.choice import NOBODY
+from pipelines.nerf.stereo.light import offsets_between
 
 Floats = NDArray[np.float64]
 
@@ -26,7 +27,6 @@ _KEEP = 1e-3
 _MOST = 0.1
 """Where the photos of a corner differ by so much more than these photos do elsewhere, one of them
 shows something else there: what lies behind the edge that the corner is on, or stands before it."""
-_OFFSET_ROUNDS, _LEAST_ERROR, _HOLD = 12, 0.01, 1e-3
 _ITERATIONS, _TOLERANCE = 300, 1e-4
 
 
@@ -71,35 +71,11 @@ def _believed(difference: Floats, photos: NDArray[np.integer[Any]]) -> Floats:
     """
     if len(difference) == 0:
         return difference
-    offsets = _offsets(difference, photos)
+    offsets = offsets_between(photos, difference, int(photos.max()) + 1)
     expected = offsets[photos[:, 1]] - offsets[photos[:, 0]]
     far_off = np.abs(difference - expected).max(axis=1) > _MOST
     believed: Floats = np.where(far_off[:, None], expected, difference)
     return believed
-
-
-def _offsets(difference: Floats, photos: NDArray[np.integer[Any]]) -> Floats:
-    """How much brighter each photo is than others, [N, 3]: least absolute errors over all seams.
-
-    By least squares whose weights are the last round's 1 / error (Weiszfeld).
-    """
-    count = int(photos.max()) + 1
-    first, second = photos.T.astype(np.int64)
-    weights = np.ones(len(difference))
-    found = np.zeros((count, 3))
-    for _ in range(_OFFSET_ROUNDS):
-        pairs = np.bincount(first * count + second, weights, count * count).reshape(count, count)
-        pairs = pairs + pairs.T
-        matrix = np.diag(pairs.sum(axis=1) + _HOLD) - pairs
-        wanted = [
-            np.bincount(second, weights * values, count)
-            - np.bincount(first, weights * values, count)
-            for values in difference.T
-        ]
-        found = np.asarray(np.linalg.solve(matrix, np.stack(wanted, axis=-1)), np.float64)
-        error = np.abs(difference - (found[second] - found[first])).max(axis=1)
-        weights = 1.0 / np.maximum(error, _LEAST_ERROR)
-    return found
 
 
 def _seams(charts: Charts, known: NDArray[np.bool_]) -> NDArray[np.intp]:

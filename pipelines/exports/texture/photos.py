@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
+from pipelines.nerf.data.light import light_table
 from pipelines.nerf.space.cameras import SceneTransform
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.picture_sampling import between_pixels, points_in_frame
@@ -62,9 +63,9 @@ class Photos:
         return pixels, shown
 
     def load(self, index: int) -> Image.Image:
-        """The photo, RGB."""
+        """The photo, RGB, in the mean light."""
         with Image.open(self._root / self._images[index].file) as opened:
-            return opened.convert("RGB")
+            return self._levelled(index, opened.convert("RGB"))
 
     def glance(self, index: int) -> tuple[Image.Image, NDArray[np.float64]]:
         """The photo, RGB, at most 640 px long, and its size as a share [2] of the whole one's."""
@@ -74,7 +75,11 @@ class Photos:
         with Image.open(self._root / self._images[index].file) as opened:
             opened.draft("RGB", small)
             glance = opened.convert("RGB").resize(small, Image.Resampling.BOX)
-        return glance, np.array([small[0] / width, small[1] / height])
+        return self._levelled(index, glance), np.array([small[0] / width, small[1] / height])
+
+    def _levelled(self, index: int, photo: Image.Image) -> Image.Image:
+        light = self._images[index].light
+        return photo if light is None else photo.point(light_table(light).T.reshape(-1).tolist())
 
     def usable(self, index: int, pixels: Floats) -> Bools:
         """Whether the photo's mask lets pixels [P, 2] count; all of them without a mask."""

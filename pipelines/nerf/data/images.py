@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from pipelines.nerf.data.light import Light, levelled
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.options.train import SplitConfig
 from pipelines.nerf.space.cameras import reduced_size
@@ -174,12 +175,14 @@ def load_images(
     long_side: int,
     masks: Sequence[Path | None] | None = None,
     *,
+    lights: Sequence[Light | None] | None = None,
     max_bytes: int | None = None,
 ) -> ImageData:
     """Read images, reduced by area averaging to at most `long_side` pixels.
 
-    masks: one-channel pictures of the same shape, black = ignore, or None for an image.
-    Transparent pictures are laid on white. max_bytes: more than that is refused unread.
+    masks: one-channel pictures of the same shape, black = ignore, or None for an image. lights: of
+    those that are brought to the mean light (`data.light`). Transparent pictures are laid on white.
+    max_bytes: more than that is refused unread.
     Memory: `memory_bytes` of the reduced sizes, and one decoded picture at a time.
     Raises NerfError `bad_image` naming the file, `too_much_memory` naming what would fit.
     """
@@ -196,9 +199,10 @@ def load_images(
             f"Set train.data.long_side_px to {fitting}, or raise train.data.max_memory_gib.",
         )
     data = ImageData.empty(sizes, masked=masked)
-    for index, (path, mask) in enumerate(zip(paths, given, strict=True)):
+    taken_in = [None] * len(paths) if lights is None else list(lights)
+    for index, (path, mask, light) in enumerate(zip(paths, given, taken_in, strict=True)):
         usable = None if mask is None else _load_mask(mask, sizes[index])
-        data.put(index, _load_image(path, long_side), usable)
+        data.put(index, levelled(_load_image(path, long_side), light), usable)
     return data
 
 

@@ -10,12 +10,15 @@ from typing import Any
 from pipelines.nerf.options.evaluate import EvaluateConfig
 
 
-def protocol(train: dict[str, Any], config: EvaluateConfig, codes: bool) -> dict[str, Any]:
+def protocol(
+    train: dict[str, Any], config: EvaluateConfig, codes: bool, *, levelled: bool = False
+) -> dict[str, Any]:
     """What was done, and the name of the protocol that it amounts to.
 
     train: the options that the model was trained with. codes: whether the model has appearance
-    codes. Names: `mipnerf360` (every 8th image, nothing optimised), `nerfstudio` (a tenth at equal
-    intervals, the test-time procedure), `stretch` (neighbours held out, nothing fitted), `custom`.
+    codes. levelled: whether its pictures were brought to one light. Names: `mipnerf360` (every 8th
+    image, nothing optimised), `nerfstudio` (a tenth at equal intervals, the test-time procedure),
+    `stretch` (neighbours held out, nothing fitted), `custom`.
     """
     data, camera_mode = train["data"], train["model"].get("camera_mode", "off")
     mode = data["eval_mode"]
@@ -42,11 +45,18 @@ def protocol(train: dict[str, Any], config: EvaluateConfig, codes: bool) -> dict
         "fit_appearance": appearance,
         "train_camera_optimizer": camera_mode,
         "train_appearance": codes,
-        "description": " ".join(_sentences(config.fit_poses, appearance)),
+        "light": "halves" if levelled else "as it is",
+        "description": " ".join(_sentences(config.fit_poses, appearance, levelled)),
     }
 
 
-def _sentences(fitted_poses: bool, fitted_appearance: bool) -> list[str]:
+_LIGHT = (
+    "The capture's exposure drifts and was levelled for training: each half of a rendered picture "
+    "has the exposure and white balance, three factors, that were measured on the other half.",
+)
+
+
+def _sentences(fitted_poses: bool, fitted_appearance: bool, levelled: bool) -> list[str]:
     return [
         "Held-out images were never trained on.",
         "Their poses were fitted to the whole images, the model fixed."
@@ -56,6 +66,7 @@ def _sentences(fitted_poses: bool, fitted_appearance: bool) -> list[str]:
         "half_unseen is measured on the other one."
         if fitted_appearance
         else "They are rendered with the mean appearance code.",
+        *_LIGHT[:levelled],
         "PSNR of the mean squared error over all usable pixels and channels of an sRGB image in "
         "[0, 1]; SSIM with an 11x11 Gaussian window, sigma 1.5; means over images.",
     ]

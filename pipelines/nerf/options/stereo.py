@@ -48,6 +48,12 @@ class StereoConfig:
         "Lay patches of even brightness on the planes that all views together show, where at least "
         "half of what is known of a patch is on one and other views do not see through it.",
     )
+    level_light: str = option(
+        "auto",
+        "Bring all pictures to one exposure and white balance before anything learns their "
+        "colours. auto does where surfaces that pictures share show that the light drifts.",
+        choices=("auto", "on", "off"),
+    )
     standing_walls: bool = option(
         True,
         "Lay patches of even brightness on upright planes where they meet a floor along a line "

@@ -16,6 +16,7 @@ from pipelines.exports.formats.ply import read_ply, write_mesh, write_points
 from pipelines.exports.frame import FrameName
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.placement import placement_of
+from pipelines.nerf.data.light import exposed
 from pipelines.nerf.stereo.maps import DepthMap
 from pipelines.sample.film import phone_camera
 from pipelines.sample.scene import depth_image, pixel_rays, pose_matrix, raycast
@@ -258,3 +259,30 @@ def test_a_mask_leaves_its_pixels_out(job: Workspace) -> None:
     after = tiny_job.run(job, "assess", long_side_px=64)["summary"]
     assert after["mesh"]["coverage"] != before["mesh"]["coverage"]
     assert after["mesh"]["psnr_with_holes"] != before["mesh"]["psnr_with_holes"]
+
+
+def test_assets_in_the_mean_light_are_seen_in_that_of_each_photo(job: Workspace) -> None:
+    """Only where training levelled the pictures: else an asset that is too dark is too dark."""
+    _exact_assets(job)
+    root = job.stage("ingest")
+    bend = 0.5
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    for number, image in enumerate(cameras.images):
+        gain = 0.7 if number % 8 else 1.4
+        with Image.open(root / image.file) as opened:
+            lit = exposed(np.asarray(opened) / 255.0, gain, bend)
+        Image.fromarray(np.rint(255.0 * lit).astype(np.uint8)).save(root / image.file)
+    dark = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert dark["views"]["light"] == "as it is"
+    lights = tuple(
+        replace(image, light=(1.0, 1.0, 1.0, bend) if image.split == "train" else None)
+        for image in cameras.images
+    )
+    replace(cameras, images=lights).save(job.stage("train") / "cameras.json")
+    lit_assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert lit_assets["views"]["light"] == "halves"
+    # The cloud's own noise (above) leaves little between a right exposure and a wrong one.
+    for asset, gained in (("mesh", 4.0), ("cloud", 1.5)):
+        assert lit_assets[asset]["psnr"] > dark[asset]["psnr"] + gained
+        assert lit_assets[asset]["coverage"] == dark[asset]["coverage"]
+    assert lit_assets["mesh"]["psnr"] > 20.0

@@ -11,12 +11,15 @@ import pytest
 from PIL import Image
 
 from pipelines.errors import Cancelled, TrainingError
+from pipelines.exports.texture.photos import Photos
 from pipelines.manifest import RunHooks
+from pipelines.nerf.data.light import exposed
 from pipelines.options import OptionsError, resolve_options
 from pipelines.sample.scene import depth_image, pose_matrix
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.depth_maps_file import INDEX, DepthMapsFile
 from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.stereo_views import undistorted_picture
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -219,3 +222,79 @@ def test_a_list_of_maps_that_makes_no_sense_is_named(tmp_path: Path) -> None:
     (tmp_path / INDEX).write_text('{"images": [{"file": "a.jpg"}]}', "utf-8")
     with pytest.raises(ValueError, match=r"maps\.json is no list of depth maps"):
         DepthMapsFile(tmp_path)
+
+
+def drifting(root: Path, bend: float = 0.5) -> tuple[Workspace, dict[str, np.ndarray]]:
+    """A capture whose exposure drifts, and each picture's gains."""
+    workspace = tiny_job.make_capture(root, num_images=24)
+    folder = workspace.stage("ingest")
+    gains = {}
+    for index, path in enumerate(sorted((folder / "images").iterdir())):
+        gain = np.exp(0.3 * np.sin(index / 3.0) * np.array([1.0, 0.9, 0.7]))
+        with Image.open(path) as opened:
+            lit = exposed(np.asarray(opened) / 255.0, gain, bend)
+        Image.fromarray(np.rint(255.0 * lit).astype(np.uint8)).save(path)
+        gains[f"images/{path.name}"] = gain
+    return workspace, gains
+
+
+def test_pictures_of_a_drifting_exposure_are_levelled(mapped: Workspace, tmp_path: Path) -> None:
+    assert mapped.manifest("depth")["summary"]["light"]["levelled"] is False
+    assert all(image.light is None for image in DepthMapsFile(mapped.stage("depth")).images)
+    workspace, gains = drifting(tmp_path / "job")
+    told = tiny_job.run(workspace, "depth", **STEREO)["summary"]["light"]
+    assert told["levelled"]
+    maps = DepthMapsFile(workspace.stage("depth"))
+    found = np.log([image.light[:3] for image in maps.images if image.light is not None])
+    true = np.log([gains[image.file] for image in maps.images])
+    assert len(found) == len(maps) == 19
+    assert np.abs((found - found.mean(axis=0)) - (true - true.mean(axis=0))).max() < 0.1
+
+    tiny_job.run(workspace, "train", max_steps=3)
+    cameras = CamerasFile.load(workspace.stage("train") / "cameras.json")
+    assert {image.split for image in cameras.images if image.light is not None} == {"train"}
+    assert {image.split for image in cameras.images if image.light is None} == {"test"}
+    metrics = tiny_job.run(workspace, "evaluate", floaters=False)["summary"]
+    assert metrics["protocol"]["light"] == "halves"
+    assert "exposure drifts" in metrics["protocol"]["description"]
+
+    off = tiny_job.run(workspace, "depth", level_light="off", **STEREO)["summary"]
+    assert off["light"] is None
+    tiny_job.run(workspace, "train", max_steps=3)
+    metrics = tiny_job.run(workspace, "evaluate", floaters=False)["summary"]
+    assert metrics["protocol"]["light"] == "as it is"
+
+
+def test_levelled_pictures_are_of_one_light_for_all_who_look(tmp_path: Path) -> None:
+    """The mean colour of what the draft shows, and of a photo that paints, differ no more."""
+    workspace, _ = drifting(tmp_path / "job")
+    tiny_job.run(workspace, "depth", **STEREO)
+    capture = CamerasFile.load(workspace.stage("ingest") / "cameras.json")
+    maps, root = DepthMapsFile(workspace.stage("depth")), workspace.images_root
+    plain = tiny_job.make_capture(tmp_path / "plain", num_images=24).images_root
+    lit = [image for image in maps.lit(capture.images) if image.light is not None]
+    lenses = [capture.cameras[image.camera] for image in lit]
+    photos = Photos(root, lit, lenses)
+    ratios: dict[str, list[float]] = {"as stored": [], "drafted": [], "painted": []}
+    for index, image in enumerate(lit):
+        with Image.open(plain / image.file) as opened:
+            true = np.asarray(opened).mean()
+        with Image.open(root / image.file) as opened:
+            ratios["as stored"].append(np.asarray(opened).mean() / true)
+        pinhole = Pinhole.of(lenses[index], 64)
+        drafted = undistorted_picture(root, image, lenses[index], pinhole)
+        ratios["drafted"].append(drafted.mean() / true)
+        assert np.array_equal(np.asarray(photos.load(index)), np.asarray(photos.glance(index)[0]))
+        ratios["painted"].append(np.asarray(photos.load(index)).mean() / true)
+    spread = {name: np.std(np.log(values)) for name, values in ratios.items()}
+    assert spread["as stored"] > 0.1
+    assert spread["drafted"] < 0.25 * spread["as stored"]
+    assert spread["painted"] < 0.25 * spread["as stored"]
+
+
+def test_maps_of_an_older_job_have_no_light(mapped: Workspace, tmp_path: Path) -> None:
+    index = json.loads((mapped.stage("depth") / INDEX).read_text("utf-8"))
+    for row in index["images"]:
+        del row["light"]
+    (tmp_path / INDEX).write_text(json.dumps(index), "utf-8")
+    assert {image.light for image in DepthMapsFile(tmp_path).images} == {None}
