@@ -28,7 +28,7 @@ from torch import Tensor
 
 from pipelines.errors import ExportError
 from pipelines.nerf.data.images import ImageData, load_images
-from pipelines.nerf.data.light import in_the_light_of
+from pipelines.nerf.data.light import gain_between, in_the_light_of, levelled
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.judging.floaters import floater_measures, opacity_of_density
 from pipelines.nerf.judging.lpips import Lpips, lpips_if_configured
@@ -217,7 +217,7 @@ def _fit(
         poses = fit_poses(
             scene.model,
             cameras,
-            views.images,
+            _in_the_scenes_light(scene, views),
             rows,
             config.test_time,
             seed=seed,
@@ -235,6 +235,25 @@ def _fit(
             progress=meter.of("appearance", "fitting held-out appearance"),
         )
     return _Fits(poses, codes)
+
+
+def _in_the_scenes_light(scene: TrainedScene, views: _Views) -> ImageData:
+    """The held-out images, levelled by what the model shows there where training levelled its own:
+    a pose must not make up for an exposure.
+    """
+    if scene.bend is None:
+        return views.images
+    sizes = [(width, height) for width, height in views.images.sizes.tolist()]
+    found = ImageData.empty(sizes, masked=views.images.valid is not None)
+    for index, image in enumerate(views.posed):
+        truth, valid = views.images.image(index).numpy(), views.images.mask(index)
+        usable = np.ones(truth.shape[:2], np.bool_) if valid is None else valid.numpy()
+        rendered = scene.render(scene.lens_of(image), views.poses[index], views.long_side)
+        shown = torch.as_tensor(rendered.rgb).detach().cpu().float().clamp(0.0, 1.0).numpy()
+        red, green, blue = gain_between(shown, truth, usable, scene.bend).tolist()
+        stored = np.rint(255.0 * truth).astype(np.uint8)
+        found.put(index, levelled(stored, (red, green, blue, scene.bend)), usable)
+    return found
 
 
 def _measure_view(

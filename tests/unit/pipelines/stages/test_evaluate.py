@@ -17,6 +17,7 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from pipelines.errors import Cancelled
 from pipelines.manifest import RunHooks
+from pipelines.nerf.data.light import exposed
 from pipelines.nerf.judging.lpips import Lpips
 from pipelines.nerf.judging.metrics import psnr, ssim
 from pipelines.nerf.training.checkpoint import load_model, save_model
@@ -135,6 +136,28 @@ def test_a_fitted_pose_brings_the_renders_closer_to_the_images(job: Workspace) -
         fit = row["pose_fit"]
         assert -10.0 * np.log10(fit["loss_before"]) == pytest.approx(before["psnr"], abs=0.3)
         assert -10.0 * np.log10(fit["loss_after"]) == pytest.approx(row["psnr"], abs=0.3)
+
+
+def test_a_pose_does_not_make_up_for_an_exposure(job: Workspace) -> None:
+    """Held-out photos taken half as bright: fitted and judged as if they were not."""
+    options: dict[str, Any] = {"floaters": False, "test_time": {**TEST_TIME, "pose_lr": 5e-3}}
+    _edit_images(job, _turn)
+    as_bright = tiny_job.run(job, "evaluate", **options, fit_poses=True)["summary"]
+    for row in as_bright["per_image"]:
+        path = job.images_root / row["file"]
+        with Image.open(path) as opened:
+            dark = exposed(np.asarray(opened) / 255.0, 0.5, 0.9)
+        Image.fromarray(np.rint(255.0 * dark).astype(np.uint8)).save(path)
+
+    def lit(image: dict[str, Any]) -> None:
+        image["light"] = [1.0, 1.0, 1.0, 0.9] if image["split"] == "train" else None
+
+    _edit_images(job, lit)
+    posed = tiny_job.run(job, "evaluate", **options, fit_poses=True)["summary"]
+    assert posed["psnr"] > as_bright["psnr"] - 1.5
+    for row, before in zip(posed["per_image"], as_bright["per_image"], strict=True):
+        ratio = row["pose_fit"]["loss_before"] / before["pose_fit"]["loss_before"]
+        assert 0.5 < ratio < 1.5
 
 
 def test_a_cancel_ends_the_fit_at_the_next_step(job: Workspace) -> None:
