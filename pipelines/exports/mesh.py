@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,11 @@ class TexturedMesh:
     normals: Floats
     uv: Floats
     texture: NDArray[np.uint8]
+
+
+def shifted(mesh: TriangleMesh | TexturedMesh, by: Floats) -> TriangleMesh | TexturedMesh:
+    """A mesh elsewhere. by: [3]."""
+    return replace(mesh, vertices=mesh.vertices + by)
 
 
 def empty_mesh() -> TriangleMesh:

@@ -10,6 +10,8 @@ metrics.lpips and metrics.floaters (null with a metrics.lpips_reason or
 metrics.floaters_reason where they were not measured),
 assets.mesh and assets.cloud {coverage, psnr, ssim, psnr_with_holes}, assets.depth_agreement and
 assets.depth (null with a reason), assets.views {held_out, num_views, width, height, note},
+assets.subject {kind, why, measures, file, region, world_from_subject} (null where mesh.extent or a
+crop leaves nothing to decide),
 warnings[] {code, message, hint, details},
 timings.<stage>_s, options, versions, artifacts[] {name, bytes, sha256}. Everything else may grow.
 
@@ -152,9 +154,13 @@ def _quality(manifests: Manifests) -> dict[str, Any]:
     """What `evaluate` and `assess` measured, as far as they did."""
     evaluated = manifests.get("evaluate", {}).get("summary", {})
     assessed = manifests.get("assess", {}).get("summary", {})
+    assets = {key: value for key, value in assessed.items() if key != "warnings"}
+    meshed = manifests.get("mesh", {}).get("summary", {})
+    if assets and "subject" in meshed:
+        assets["subject"] = meshed["subject"]
     return {
         "metrics": {key: evaluated.get(key) for key in _METRICS},
-        "assets": {key: value for key, value in assessed.items() if key != "warnings"} or None,
+        "assets": assets or None,
     }
 
 

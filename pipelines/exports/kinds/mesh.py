@@ -39,7 +39,8 @@ _FILES: dict[Format, str] = {
     "usdz": "mesh.usdz",
 }
 _RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
-_REFINE_SHARE, _REDUCE_SHARE, _TEXTURE_SHARE = 0.83, 0.86, 0.97
+_REFINE_SHARE, _REDUCE_SHARE, _TEXTURE_SHARE = 0.83, 0.86, 0.96
+_SUBJECT_SHARE = 0.98
 _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 """Photos that refine the mesh are so long, or shorter where all of them would have more pixels."""
 
@@ -57,6 +58,14 @@ class MeshOptions(CropOptions, TextureOptions):
     up_axis: Axis = Field(
         "z",
         description="Which axis is up in ply, obj and stl. In glb and usdz it is always y.",
+    )
+
+    extent: Literal["auto", "subject", "scene"] = Field(
+        "auto",
+        description="scene is all that lies within far_distance, more coarsely beyond "
+        "max_distance. auto is scene, and where somebody walked round a thing also subject.glb: "
+        "that thing with what it stands on. subject is that thing alone as the mesh itself, or "
+        "what lies within max_distance where none is found. A crop overrides it.",
     )
 
     method: Literal["tsdf", "poisson"] = Field(
@@ -145,10 +154,13 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     """
     # Imported where it runs: the API reads this file too.
     from pipelines.exports.crop import crop_of, cropped, empty_crop, narrowed, surface_in
+    from pipelines.exports.cutting import cut_out
     from pipelines.exports.formats import glb
     from pipelines.exports.levels import levels_of, texture_px_of
     from pipelines.exports.placement import placement_of
     from pipelines.exports.reduction import reduced
+    from pipelines.exports.subject import find_subject
+    from pipelines.exports.subject_files import as_dict, gaze_of, save_subject
     from pipelines.exports.surface.refinement import refined
     from pipelines.exports.surface.shells import Subject, affordable, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
@@ -215,6 +227,21 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             noise=max((shell.voxel for shell in shells if not shell.is_far), default=0.0),
         )
         del photos
+    gaze = gaze_of(shown, [scene.lens_of(image) for image in shown])
+    decision = None
+    if crop is None and options.extent != "scene":
+        ctx.progress(_REFINE_SHARE, "looking for the subject")
+        near = shells[0].bounds
+        wanted = (near.focus, near.distance) if options.extent == "subject" else None
+        decision = find_subject(mesh.vertices, mesh.faces, gaze, wanted)
+    subject = None if decision is None else as_dict(decision)
+    thing = None if decision is None else decision.thing
+    if thing is not None and options.extent == "subject":
+        mesh, thing = cut_out(mesh, thing), None
+        if len(mesh.faces) == 0:
+            raise _empty("nothing is left of the subject")
+    elif options.extent == "subject" and crop is None:
+        ctx.logger.warning("No subject was found; the mesh is what lies within max_distance.")
     whole, mesh = mesh, cropped(mesh, crop)
     if crop is not None and len(mesh.faces) == 0:
         raise empty_crop(crop, whole.vertices, "mesh")
@@ -248,6 +275,12 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         levels.append({"file": path.name, **_told(coarse)})
     ctx.progress(_TEXTURE_SHARE, "writing")
     _write(place.mesh(mesh), place.mesh(skin), options, ctx, frame)
+    if thing is not None and subject is not None:
+        ctx.progress(_SUBJECT_SHARE, "cutting out the subject")
+        metric, style = scene.cameras.metric, style_of(options)
+        subject |= save_subject(
+            ctx.out, mesh, skin, thing, gaze, metric, style, ctx.check_cancelled
+        )
     return {
         "frame": place.as_dict(),
         "formats": list(options.formats),
@@ -258,6 +291,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         "num_views": len(images),
         "voxel": round(shells[0].voxel, 9),
         "coarser": coarser,
+        "subject": subject,
         "bounds": shells[0].bounds.as_dict(),
         "shells": [
             {"voxel": round(shell.voxel, 9), **shell.bounds.as_dict()} for shell in shells[1:]
@@ -342,12 +376,14 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=9,
+    version=10,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,
     artifacts=(
         Artifact("mesh.glb", "mesh.glb", "model/gltf-binary", "any glTF viewer, Blender"),
+        Artifact("subject.glb", "subject.glb", "model/gltf-binary", "any glTF viewer, Blender"),
+        Artifact("subject.jpg", "subject.jpg", "image/jpeg", "any viewer"),
         Artifact(
             "mesh.ply", "mesh.ply", "application/octet-stream", "MeshLab, CloudCompare, Blender"
         ),

@@ -23,7 +23,7 @@ Ints = NDArray[np.int32]
 
 CELL_PX = 4
 """Side of the cell of a face that no photo shows."""
-_MARGIN_PX = 3
+MARGIN_PX = 3
 """What a patch shows of its photo around its faces, so that smaller copies of the texture do not
 mix in what lies beside it."""
 _SHRINK = 0.93
@@ -137,8 +137,8 @@ def _boxes(charts: Charts, shown: Ints, size_of: Callable[[int], tuple[int, int]
     np.minimum.at(low, charts.chart, charts.place)
     np.maximum.at(high, charts.chart, charts.place)
     sizes = np.array([size_of(int(photo)) for photo in charts.photo[shown]]).reshape(-1, 2)
-    start = np.maximum(np.floor(low[shown]) - _MARGIN_PX, 0)
-    end = np.minimum(np.ceil(high[shown]) + _MARGIN_PX, sizes)
+    start = np.maximum(np.floor(low[shown]) - MARGIN_PX, 0)
+    end = np.minimum(np.ceil(high[shown]) + MARGIN_PX, sizes)
     boxes: Ints = np.concatenate([start, end], axis=1).astype(np.int32)
     return boxes
 
@@ -173,6 +173,12 @@ def _packed(size: Floats, scale: float, num_cells: int, side: int) -> tuple[Ints
         target[index] = x, y, x + w, y + h
         x += w
     return target, y + height
+
+
+def shelves(size: Floats, side: int) -> Ints | None:
+    """Places of rectangles [N, 2] in a square, as left, top, right, bottom [N, 4]; None if full."""
+    packed = _packed(size, 1.0, 0, side)
+    return None if packed is None else packed[0]
 
 
 def _place_cells(charts: Charts, cells: NDArray[np.intp], top: int, side: int, uv: Floats) -> None:

@@ -53,6 +53,8 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
     assert assets["views"]["num_views"] == 5
     assert assets["depth_reason"]
     assert "warnings" not in assets
+    assert assets["subject"] == report["stages"]["mesh"]["subject"]
+    assert assets["subject"]["kind"] == "subject"
     for warning in report["warnings"]:
         assert warning["code"] == "geometry_poor"
     ran = {"ingest", "train", "evaluate", *KINDS, "assess"}
@@ -67,6 +69,8 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
         "pointcloud.ply",
         "mesh.glb",
         "mesh.ply",
+        "subject.glb",
+        "subject.jpg",
         "video.mp4",
         "preview.jpg",
         "transforms.json",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import open3d
 import pytest
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from pipelines.errors import Cancelled, ExportError
@@ -18,6 +19,7 @@ from pipelines.exports.texture import charts
 from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
 from pipelines.workspace import Workspace
+from tests.gltf_validator import problems_of
 from tests.unit.pipelines.stages import tiny_job
 
 
@@ -35,7 +37,7 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
     np.testing.assert_allclose(glb[:, 1].min(), mesh.points[:, 2].min(), atol=1e-4)
     np.testing.assert_allclose(glb[:, 2].max(), -mesh.points[:, 1].min(), atol=1e-4)
     files = {path.name for path in job.stage("mesh").iterdir()}
-    assert files == {"mesh.ply", "mesh.glb", "manifest.json"}
+    assert files == {"mesh.ply", "mesh.glb", "subject.glb", "subject.jpg", "manifest.json"}
 
 
 def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
@@ -46,7 +48,7 @@ def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
     assert manifest["summary"]["formats"] == ["usdz", "stl"]
     files = {file["path"] for file in manifest["files"]}
     artifacts = {artifact.path for artifact in get_stage("mesh").artifacts}
-    assert files & artifacts == {"mesh.usdz", "mesh.stl"}
+    assert files & artifacts == {"mesh.usdz", "mesh.stl", "subject.glb", "subject.jpg"}
     assert files - artifacts == {"judged.glb"}
     judged = read_mesh(job.stage("mesh") / "judged.glb")
     assert isinstance(judged, TexturedMesh)
@@ -80,7 +82,7 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
         full = "texture_px" in spoil
         if full:
             monkeypatch.setattr(charts, "_LEAST_SCALE", 1.0)
-            monkeypatch.setattr(charts, "_MARGIN_PX", 40)
+            monkeypatch.setattr(charts, "MARGIN_PX", 40)
         plain = tiny_job.run(job, "mesh", **spoil)["summary"]
         assert plain["texture_px"] is None
         assert not isinstance(read_mesh(job.stage("mesh") / "mesh.glb"), TexturedMesh)
@@ -120,6 +122,54 @@ def test_the_subject_alone_ends_where_its_bounds_do(job: Workspace) -> None:
     assert np.ptp(whole.points, axis=0).max() > 1.2 * np.ptp(alone.points, axis=0).max()
 
 
+def test_who_walked_round_a_thing_gets_it_besides_the_mesh(job: Workspace) -> None:
+    plain = tiny_job.run(job, "mesh", extent="scene", frame="normalised")["summary"]
+    assert plain["subject"] is None
+    assert not (job.stage("mesh") / "subject.glb").exists()
+    whole = (job.stage("mesh") / "mesh.glb").read_bytes()
+    found = tiny_job.run(job, "mesh", frame="normalised")["summary"]["subject"]
+    assert (job.stage("mesh") / "mesh.glb").read_bytes() == whole, "it covers what was filmed"
+    assert (found["kind"], found["file"]) == ("subject", "subject.glb"), found
+    path = job.stage("mesh") / "subject.glb"
+    assert problems_of(path) == []
+    cut, mesh = read_mesh(path), read_mesh(job.stage("mesh") / "mesh.glb")
+    assert isinstance(cut, TexturedMesh)
+    assert 100 < len(cut.faces) == found["num_faces"] < len(mesh.faces)
+    # In the file it stands in the world's axes; read back it lies over the mesh.
+    region = found["region"]
+    away = cut.vertices - np.asarray(region["center"])
+    turn = -np.radians(region["rotation_deg"][2])
+    away = away @ np.array(
+        [[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
+    assert (np.abs(away) <= np.asarray(region["size"]) / 2.0 + 1e-4).all()
+    off, _ = cKDTree(mesh.vertices).query(cut.vertices)
+    assert np.median(off) < 1e-3
+    back = np.asarray(found["world_from_subject"])
+    y_up = np.asarray(open3d.io.read_triangle_mesh(path).vertices)
+    z_up = np.stack([y_up[:, 0], -y_up[:, 2], y_up[:, 1]], axis=1)
+    np.testing.assert_allclose(
+        np.sort(z_up + back[:, 3], axis=0), np.sort(cut.vertices, axis=0), atol=1e-4
+    )
+    with Image.open(job.stage("mesh") / "subject.jpg") as picture:
+        assert picture.width == 4 * picture.height
+
+
+def test_a_subject_asked_for_is_the_mesh_and_a_crop_overrides_it(job: Workspace) -> None:
+    found = tiny_job.run(job, "mesh", extent="subject", texture="none")["summary"]["subject"]
+    assert found["file"] is None
+    assert not (job.stage("mesh") / "subject.glb").exists()
+    mesh = read_mesh(job.stage("mesh") / "mesh.glb")
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    size, center = np.asarray(found["region"]["size"]), np.asarray(found["region"]["center"])
+    assert (np.abs(mesh.vertices[:, 2] - center[2]) <= size[2] / 2.0 + 1e-4).all()
+    assert (high - low)[:2].max() <= np.hypot(*size[:2])
+    crop = {"shape": "box", "center": center.tolist(), "size": (size / 2.0).tolist()}
+    by_hand = tiny_job.run(job, "mesh", crop=crop, texture="none")["summary"]
+    assert by_hand["subject"] is None
+    assert not (job.stage("mesh") / "subject.glb").exists()
+
+
 def test_a_crop_that_holds_nothing_is_an_error(job: Workspace) -> None:
     with pytest.raises(ExportError) as caught:
         tiny_job.run(job, "mesh", max_distance=1e-6, extent="subject")
@@ -134,7 +184,7 @@ def test_a_cancel_ends_the_stage(job: Workspace) -> None:
     assert not job.stage("mesh").exists()
 
 
-@pytest.mark.parametrize("part", ["fusing depth", "painting"])
+@pytest.mark.parametrize("part", ["fusing depth", "painting", "cutting out the subject"])
 def test_a_cancel_is_noticed_at_the_next_word_of_any_part(job: Workspace, part: str) -> None:
     messages: list[str] = []
     hooks = RunHooks(
