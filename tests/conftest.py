@@ -1,9 +1,14 @@
-"""Fixtures for every test: real servers (`tests/services.py`)."""
+"""Fixtures for every test: real servers (`tests/services.py`); which tests share a process."""
 
 from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
 
 # Before anything loads torch: OpenMP's threads must sleep while they wait, as in every process of
 # the service, or two cores are busy waiting for each other.
@@ -31,3 +36,21 @@ __all__ = [
     "redis_server",
     "s3_endpoint",
 ]
+
+
+class Scheduling(LoadFileScheduling):  # type: ignore[misc]
+    """Tests of a file share a process, for its fixtures; so do all of e2e.
+
+    Those share a film and compiled kernels, and a job uses every core: two at once would only be in
+    each other's way.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        file: str = super()._split_scope(nodeid)
+        return "e2e" if "e2e" in Path(file).parts else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling | None:
+    """The above in place of xdist's own `--dist loadfile`."""
+    return Scheduling(config, log) if config.getoption("dist") == "loadfile" else None
