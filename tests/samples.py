@@ -12,8 +12,8 @@ from typing import Any
 from pipelines.sample.film import film_capture
 
 SMALL: dict[str, Any] = {
-    "frames": {"num_frames": 40, "long_side_px": 640},
-    "poses": {"max_image_px": 640, "num_features": 2048},
+    "frames": {"num_frames": 40, "long_side_px": 480},
+    "poses": {"max_image_px": 480, "num_features": 2048},
     "depth": {"long_side_px": 160, "num_planes": 64},
     "train": {
         "max_steps": 400,
@@ -28,9 +28,26 @@ SMALL: dict[str, Any] = {
     "video": {"num_frames": 16, "long_side_px": 160},
 }
 
+PLAIN: dict[str, Any] = {
+    "draft": {"texture": "none", "resolution": 64, "num_views": 12},
+    "evaluate": {"floaters": False},
+    "mesh": {
+        "resolution": 64,
+        "num_views": 12,
+        "render_long_side_px": 96,
+        "texture": "none",
+        "refine": "none",
+    },
+    "video": {"num_frames": 8, "long_side_px": 96},
+}
+"""For whole jobs of tests that look at no mesh and no video."""
+
 
 def sample_clip(folder: Path) -> tuple[Path, Path]:
-    """Film the analytic scene, small. Returns the clip and its true cameras (cameras.json)."""
+    """Film the analytic scene, small; its frames are twice as many as `SMALL` keeps, and larger.
+
+    Returns the clip and its true cameras (cameras.json).
+    """
     clip, truth = folder / "sample.mp4", folder / "truth.json"
-    film_capture(clip, long_side_px=960).save(truth)
+    film_capture(clip, num_frames=80, long_side_px=640).save(truth)
     return clip, truth

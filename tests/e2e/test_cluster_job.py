@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from api.client.client import Client
 from deploy.embedded import Embedded, free_port
+from pipelines.options import merge
 from tests.capture_writers import write_polycam
 from tests.e2e.waiting import succeeded
-from tests.samples import SMALL
+from tests.samples import PLAIN, SMALL
 from tests.services import RedisServer, S3Endpoint
 
 pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
@@ -33,8 +33,8 @@ def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
     }.items():
         monkeypatch.setenv(name, value)
     archive = tmp_path / "polycam.zip"
-    write_polycam(archive, num=40)
-    options: dict[str, Any] = dict(SMALL)
+    write_polycam(archive, num=40, width=480)
+    options = merge(SMALL, PLAIN)
 
     embedded = Embedded.at(tmp_path / "home", "127.0.0.1", free_port(), cache)
     supervisor = embedded.supervisor(print)

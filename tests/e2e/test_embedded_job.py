@@ -20,15 +20,14 @@ from pipelines.sample.judge import judge_mesh, judge_poses
 from pipelines.scene.cameras_file import CamerasFile
 from tests.capture_writers import write_hdr_hevc
 from tests.e2e.waiting import succeeded
-from tests.samples import SMALL
+from tests.samples import PLAIN, SMALL
 
 pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 
 BRIEF = {
+    **PLAIN,
     "frames": {"num_frames": 32},
     "pointcloud": {"num_points": 5000, "extent": "subject"},
-    "mesh": {"resolution": 64, "num_views": 12, "render_long_side_px": 96},
-    "video": {"num_frames": 8, "long_side_px": 96},
 }
 
 REPORT_KEYS = (
@@ -89,7 +88,7 @@ def test_hdr_rotated_hevc_clip_goes_through(
 ) -> None:
     client, embedded, _ = service
     clip = tmp_path / "IMG_0001.MOV"
-    truth = write_hdr_hevc(clip, num=60, long_side_px=640)
+    truth = write_hdr_hevc(clip, num=48, long_side_px=480)
     capture = client.upload(clip)
     assert capture.kind == "video"
     job = client.create_job(capture.id, preset="preview", options=merge(SMALL, BRIEF))

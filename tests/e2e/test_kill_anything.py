@@ -23,6 +23,7 @@ from deploy.embedded import Embedded
 from deploy.supervisor import Supervisor
 from tests.capture_writers import write_nerfstudio
 from tests.e2e.waiting import succeeded
+from tests.samples import PLAIN
 
 pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 
@@ -40,8 +41,7 @@ TINY: dict[str, Any] = {
         },
     },
     "pointcloud": {"num_points": 2000},
-    "mesh": {"resolution": 64, "num_views": 12, "render_long_side_px": 96},
-    "video": {"num_frames": 8, "long_side_px": 96},
+    **PLAIN,
 }
 
 
