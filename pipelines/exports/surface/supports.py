@@ -68,9 +68,8 @@ def cells_of(
     member = member.reshape(-1)
 
     def total(values: Floats) -> Floats:
-        return np.stack(
-            [np.bincount(member, values[:, axis], len(cells)) for axis in range(3)], axis=1
-        )
+        columns = [np.bincount(member, values[:, axis], len(cells)) for axis in range(3)]
+        return np.stack(columns, axis=1).astype(np.float64)  # of nothing, bincount gives integers
 
     summed: Floats = np.bincount(member, areas, len(cells)).astype(np.float64)
     kept = summed > 0.0

@@ -283,3 +283,26 @@ def test_the_sample_is_a_subject_and_the_room_is_not() -> None:
     mesh, gaze = _seen_mesh("room")
     found = find_subject(mesh.vertices, mesh.faces, gaze)
     assert (found.kind, found.thing) == ("scene", None)
+
+
+SPECK = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("vertices", "num_faces"),
+    [
+        (np.zeros((0, 3)), 0),
+        (SPECK, 1),
+        (0.0 * SPECK, 1),  # a face without an area
+        (SPECK + 1e6, 1),
+        (1e9 * SPECK, 1),
+    ],
+    ids=["empty", "speck", "no area", "far away", "huge"],
+)
+def test_a_mesh_with_hardly_anything_in_it_is_a_scene(vertices: np.ndarray, num_faces: int) -> None:
+    faces = np.arange(3 * num_faces, dtype=np.int32).reshape(-1, 3)
+    gaze = seen_from(around(360.0), MIDDLE)
+    for where in (None, (np.zeros(3), 1.0)):
+        found = find_subject(vertices, faces, gaze, where)
+        assert (found.kind, found.thing) == ("scene", None)
+        assert found.why
