@@ -28,6 +28,8 @@ _SHOULDER = (0.94, 0.99)
 """What is too bright to be shown, a window, is so in any light: from here to there a value that
 would become darker goes over to what it was."""
 _MIN_PIXELS = 50
+_SQUARES = 16
+"""Of the chess board along a picture's long side."""
 
 
 def exposed(colors: NDArray[Any], gain: Any, bend: float) -> Floats:
@@ -91,13 +93,15 @@ def in_the_light_of(
 ) -> NDArray[np.float32]:
     """What shows the scene in the mean light, as the photo's exposure would have it, [H, W, 3].
 
-    The gain of the left half is measured on the right one and the other way round, so that no pixel
-    is compared with a colour that it took part in. Arguments as of `gain_between`.
+    The picture is halved like a chess board. The gain of its white squares is measured on the black
+    ones and the other way round, so that no pixel is compared with a colour that it took part in,
+    and both halves show the same things: those that shine would give the left and the right half
+    different gains. Arguments as of `gain_between`.
     """
     shown = np.array(scene, np.float32)
-    middle = shown.shape[1] // 2
-    halves = (slice(0, middle), slice(middle, None))
-    for asked, told in (halves, halves[::-1]):
-        gain = gain_between(scene[:, asked], photo[:, asked], usable[:, asked], bend)
-        shown[:, told] = _relit(shown[:, told], gain, bend)
+    rows, columns = (np.arange(side) * _SQUARES // max(shown.shape) for side in shown.shape[:2])
+    white = (rows[:, None] + columns) % 2 == 0
+    for asked, told in ((white, ~white), (~white, white)):
+        gain = gain_between(scene, photo, usable & asked, bend)
+        shown[told] = _relit(shown[told], gain, bend)
     return shown

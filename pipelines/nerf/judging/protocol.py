@@ -51,8 +51,9 @@ def protocol(
 
 
 _LIGHT = (
-    "The capture's exposure drifts and was levelled for training: each half of a rendered picture "
-    "has the exposure and white balance, three factors, that were measured on the other half.",
+    "The capture's exposure drifts and was levelled for training: a rendered picture is halved "
+    "like a chess board, and each half has the exposure and white balance, three factors, that "
+    "were measured on the other one.",
 )
 
 
