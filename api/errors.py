@@ -19,8 +19,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from sqlalchemy.exc import DataError, DBAPIError, InterfaceError, OperationalError
-from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+from sqlalchemy.exc import DataError, DBAPIError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute
@@ -41,7 +40,7 @@ from api.problems import (
 )
 from pipelines.errors import CaptureError, PipelineError, ResourceError
 from pipelines.options import OptionsError
-from storage.db import is_full
+from storage.db import is_away, is_full
 from storage.errors import (
     ConflictError,
     IdempotencyReusedError,
@@ -231,7 +230,7 @@ def to_api_error(error: Exception) -> ApiError:
         return _of_storage(error)
     if isinstance(error, DBAPIError) and is_full(error):
         return NoSpaceError("The database has no room left.")
-    if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError):
+    if isinstance(error, SQLAlchemyError) and is_away(error):
         return UnavailableError("The database does not answer.", code="database_unavailable")
     if isinstance(error, DataError | UnicodeEncodeError):
         return InvalidRequestError("The request holds text or a number that cannot be stored.")
@@ -350,10 +349,7 @@ def install(
         RequestValidationError,
         HTTPException,
         StorageError,
-        OperationalError,
-        InterfaceError,
-        PoolTimeoutError,
-        DataError,
+        SQLAlchemyError,
         UnicodeEncodeError,
         OSError,
     ):

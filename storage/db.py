@@ -38,7 +38,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.engine import Connection
-from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session, sessionmaker
 
 from storage.steps import reached
@@ -50,6 +51,7 @@ ASK_AGAIN_MS = 10
 STATEMENT_S = 15.0
 POOL_S = 10.0
 ACTOR = "actor"
+_ENDED = ("25P03", "25P04")  # idle within a transaction, or in one, for too long
 """Key of `Session.info`: who changes something in this session. Events carry the name."""
 
 
@@ -149,6 +151,20 @@ def first_and_now(session: Session, query: Select[Any]) -> tuple[Any, datetime] 
     moment = func.clock_timestamp(type_=UtcDateTime())
     both = session.execute(query.add_columns(moment).limit(1)).first()
     return None if both is None else (both[0], both[1])
+
+
+def is_away(error: SQLAlchemyError) -> bool:
+    """Whether the database cannot be reached, has no time, or ended the connection: it may answer
+    later.
+
+    PostgreSQL ends one whose client was too slow within a transaction, as a machine that slept is,
+    with an error that the driver takes for an internal one.
+    """
+    if isinstance(error, OperationalError | InterfaceError | PoolTimeoutError):
+        return True
+    return isinstance(error, DBAPIError) and (
+        error.connection_invalidated or getattr(error.orig, "sqlstate", None) in _ENDED
+    )
 
 
 def is_locked(error: DBAPIError) -> bool:

@@ -6,8 +6,6 @@ import errno
 import signal
 from typing import Any
 
-from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError, TimeoutError
-
 from pipelines.errors import PipelineError, ResourceError
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
 from worker.locks import FolderInUseError
@@ -16,11 +14,6 @@ from worker.locks import FolderInUseError
 class UnknownOutcomeError(Exception):
     """The database did not say whether it recorded the end of an attempt: nothing may be deleted,
     for the row may name it. What nothing names is swept up later."""
-
-
-def is_away(error: SQLAlchemyError) -> bool:
-    """Whether the database cannot be reached, or has no time: it may answer later."""
-    return isinstance(error, OperationalError | InterfaceError | TimeoutError)
 
 
 class StopRunError(Exception):

@@ -25,7 +25,7 @@ from pipelines.stage import Stage
 from pipelines.workspace import Workspace
 from storage import keys
 from storage.claims import Claim
-from storage.db import Database
+from storage.db import Database, is_away
 from storage.errors import LostLeaseError, NotFoundError, StorageError
 from storage.leases import (
     FailureReport,
@@ -56,7 +56,6 @@ from worker.outcomes import (
     failed_of,
     failure_of,
     gave_up_of,
-    is_away,
     stalled_of,
     time_limit_of,
 )

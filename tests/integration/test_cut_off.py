@@ -15,11 +15,12 @@ from typing import Any
 
 import pytest
 from sqlalchemy import text
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
+from api.errors import to_api_error
 from storage.claims import Claim, claim_stage
-from storage.db import Database, now
+from storage.db import Database, is_away, now
 from storage.jobs import stage_id
 from storage.leases import heartbeat, reap_expired, save_checkpoint, succeed_stage
 from storage.models import StageRow
@@ -135,6 +136,29 @@ def test_a_transaction_that_nobody_ends_is_ended_well_before_a_lease(database: D
     most_s = float(told.removesuffix("s"))
     settings = WorkerSettings()
     assert 0 < most_s <= (settings.lease_s - settings.heartbeat_s) / 3
+
+
+def test_a_client_too_slow_within_a_transaction_is_told_to_come_again(postgres_url: str) -> None:
+    """PostgreSQL ends its connection, as after a sleep of the machine; the driver calls that an
+    internal error, and a caller must not.
+    """
+    slow = Database(postgres_url, deadline_s=DEADLINE_S)
+
+    def dawdle() -> None:
+        with slow.session_scope() as session:
+            session.execute(text("SELECT 1"))
+            time.sleep(DEADLINE_S + 1.0)
+            session.execute(text("SELECT 1"))
+
+    with pytest.raises(SQLAlchemyError) as caught:
+        dawdle()
+    assert not isinstance(caught.value, OperationalError), "then this test asks for nothing"
+    assert is_away(caught.value)
+    answer = to_api_error(caught.value)
+    assert (answer.status, answer.code) == (503, "database_unavailable")
+    with slow.session_scope() as session:
+        assert session.scalar(text("SELECT 1")) == 1
+    slow.dispose()
 
 
 @pytest.mark.parametrize("held", ["stage", "job"])
