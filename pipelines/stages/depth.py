@@ -156,19 +156,24 @@ def _light(
     nothing: list[Light | None] = [None] * len(images)
     if config.level_light == "off":
         return nothing, None
-    ctx.progress(1.0 - _LIGHT_SHARE, "comparing the pictures' light")
+
+    def on_progress(share: float) -> None:
+        done = 1.0 - _LIGHT_SHARE * (1.0 - share)
+        ctx.progress(done, "comparing the pictures' light")
+
     depths = [found.z for found in maps]
     points = surface_points(views, depths)
     if len(points) == 0:
         return nothing, None
-    pictures = [
-        undistorted_picture(
-            ctx.workspace.images_root, image, capture.cameras[image.camera], _pinhole(view)
-        )
-        for image, view in zip(images, views, strict=True)
-    ]
+    pictures = []
+    for index, (image, view) in enumerate(zip(images, views, strict=True)):
+        on_progress(0.5 * index / len(images))
+        lens, root = capture.cameras[image.camera], ctx.workspace.images_root
+        pictures.append(undistorted_picture(root, image, lens, _pinhole(view)))
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
-    light = find_light(views, depths, pictures, neighbours)
+    light = find_light(
+        views, depths, pictures, neighbours, lambda share: on_progress(0.5 + 0.5 * share)
+    )
     level = config.level_light == "on" or light.is_drifting
     told = {
         "levelled": level,

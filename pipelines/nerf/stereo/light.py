@@ -9,7 +9,7 @@ features", IJCV 2007, section 6, with depths in place of a homography. Symbols: 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ surfaces that shine, are no gains."""
 _BENDS = (0.0, 0.25, 0.5, 0.7, 0.8, 0.9, 1.0)
 _MOST_POINTS, _MOST_SHARED, _MIN_SHARED = 3000, 500, 100
 _WITHIN = 0.02
+_COMPARING = 0.6
 _ROUNDS, _LEAST_ERROR, _HOLD = 12, 0.01, 1e-3
 
 
@@ -74,15 +75,17 @@ def find_light(
     depths: Sequence[Depths],
     pictures: Sequence[NDArray[np.uint8]],
     neighbours: Sequence[Sequence[int]],
+    on_progress: Callable[[float], None] = lambda done: None,
 ) -> CaptureLight:
     """The gains of V views; 1 for those that share nothing with others.
 
     depths: [H, W], 0 where unknown; pictures: [H, W, 3], of the views' own cameras; neighbours: of
     each view those it is compared with. The bend is the one with which levelled pictures differ
-    least.
+    least. on_progress: told the share that is done; may raise.
     """
     shared = []
     for index, view in enumerate(views):
+        on_progress(_COMPARING * index / len(views))
         points, colors = _known_points(view, depths[index], pictures[index])
         for other in neighbours[index]:
             same, there = _seen_too(points, views[other], depths[other], pictures[other])
@@ -91,7 +94,10 @@ def find_light(
                 shared.append(_Shared(index, other, colors[same[::step]], there[::step]))
     if not shared:
         return CaptureLight(np.ones((len(views), 3)))
-    tried = [_with_bend(shared, len(views), bend) for bend in _BENDS]
+    tried = []
+    for index, bend in enumerate(_BENDS):
+        on_progress(_COMPARING + (1.0 - _COMPARING) * index / len(_BENDS))
+        tried.append(_with_bend(shared, len(views), bend))
     return min(tried, key=lambda found: found[0])[1]
 
 

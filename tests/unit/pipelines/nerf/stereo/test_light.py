@@ -99,3 +99,20 @@ def test_one_wrong_pair_does_not_move_the_others() -> None:
     differences[3] += 2.0
     found = offsets_between(pairs, differences, 5)
     assert found - found[0] == pytest.approx(values, abs=0.02)
+
+
+def test_progress_moves_and_may_end_it() -> None:
+    views, depths, pictures = scene()
+    lit = [stored(picture) for picture in pictures]
+    told: list[float] = []
+    find_light(views, depths, lit, NEIGHBOURS, told.append)
+    assert told == sorted(told)
+    assert len(told) >= COUNT + 5
+    assert (told[0], told[-1] < 1.0) == (0.0, True)
+
+    def stop(done: float) -> None:
+        if done > 0.7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        find_light(views, depths, lit, NEIGHBOURS, stop)
