@@ -36,6 +36,8 @@ from storage.schema import upgrade
 
 VERSION = "1"
 DRAIN_S = 2.0
+PREPARE_S = 0.5
+"""After the start: the first answer comes first."""
 PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 logger = logging.getLogger("nerfworks.api")
 
@@ -85,6 +87,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     threads = ThreadPoolExecutor(services.settings.max_uploads, thread_name_prefix="upload")
     asyncio.get_running_loop().set_default_executor(threads)
     app.state.services = services
+    services.bell.prepare(PREPARE_S)
     try:
         yield
     finally:

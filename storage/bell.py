@@ -138,6 +138,14 @@ class Bell:
                 self._opened = Broker(self._redis_url, self._timeout_s)
             return self._opened
 
+    def prepare(self, delay_s: float) -> None:
+        """Open the broker beside what else is done, so late: or the first to ring would have all
+        others wait for its import. Never waits.
+        """
+        timer = threading.Timer(delay_s, self._broker)
+        timer.daemon = True
+        timer.start()
+
     def ping(self) -> None:
         """Raises `storage.broker.BrokerError`, an OSError, where the broker does not answer."""
         self._broker().ping()

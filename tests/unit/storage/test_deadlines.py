@@ -233,3 +233,14 @@ def test_whoever_deletes_waits_for_the_store_only_so_long(tmp_path: Path, gate: 
     whole.close(1)
     with database.read_scope() as session:
         assert session.query(PendingDeletion).count() == 0
+
+
+def test_the_broker_is_there_before_anybody_rings(tmp_path: Path) -> None:
+    bell = Bell("redis://127.0.0.1:1/0", make_database(tmp_path))
+    assert bell._opened is None
+    bell.prepare(0.01)
+    deadline = time.monotonic() + 30
+    while bell._opened is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    bell.close()
