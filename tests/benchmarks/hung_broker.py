@@ -41,6 +41,8 @@ from worker.settings import WorkerSettings
 CONNECTIONS = 8
 NUM_LEASES = 20
 LEASE_STEP_S = 0.25
+SETTLE_S = 2.0
+"""An API that started just now imports the broker's library (`storage.bell.Bell.prepare`)."""
 TICK_S = 1.0
 
 
@@ -130,6 +132,7 @@ def report(kind: str, posts: int) -> None:
             serving(url, broker.port) as address,
             httpx.Client(base_url=address, headers=HEADERS, timeout=120) as http,
         ):
+            time.sleep(SETTLE_S)
             database = Database(url)
             with reaping(database, broker.port, Path(folder)) as late:
                 found = measure(http, posts)
