@@ -42,6 +42,7 @@ class Bell:
         self._redis_url = redis_url
         self._opened: Broker | None = None
         self._opening = threading.Lock()
+        self._preparing: threading.Timer | None = None
         self._breaker = Breaker()
         self._changed = threading.Condition()
         self._pending: dict[str, None] = {}  # in order, each id once
@@ -142,9 +143,9 @@ class Bell:
         """Open the broker beside what else is done, so late: or the first to ring would have all
         others wait for its import. Never waits.
         """
-        timer = threading.Timer(delay_s, self._broker)
-        timer.daemon = True
-        timer.start()
+        self._preparing = threading.Timer(delay_s, self._broker)
+        self._preparing.daemon = True
+        self._preparing.start()
 
     def ping(self) -> None:
         """Raises `storage.broker.BrokerError`, an OSError, where the broker does not answer."""
@@ -157,5 +158,7 @@ class Bell:
             self._changed.notify_all()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
+        if self._preparing is not None:
+            self._preparing.cancel()
         if self._opened is not None:
             self._opened.close()

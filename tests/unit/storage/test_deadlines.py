@@ -244,3 +244,13 @@ def test_the_broker_is_there_before_anybody_rings(tmp_path: Path) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     bell.close()
+
+
+def test_a_bell_that_is_closed_opens_no_broker(tmp_path: Path) -> None:
+    bell = Bell("redis://127.0.0.1:1/0", make_database(tmp_path))
+    bell.prepare(0.3)
+    bell.close()
+    assert bell._preparing is not None
+    bell._preparing.join(10)
+    assert not bell._preparing.is_alive()
+    assert bell._opened is None
