@@ -72,15 +72,20 @@ class TextureOptions(StageOptions):
     )
 
 
-_World = Annotated[float, Field(ge=-1e6, le=1e6)]
+_World = Annotated[float, Field(ge=-1e8, le=1e8)]
 _Side = Annotated[float, Field(gt=0, le=1e6)]
 _Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
 class CropShapeOptions(StageOptions):
-    """A part of the scene, cut out by hand, in the frame of the export."""
+    """A part of the scene, in the frame of the export."""
 
-    shape: Literal["none", "box", "sphere"] = Field("none", description="What is kept.")
+    shape: Literal["none", "box", "sphere", "auto"] = Field(
+        "none",
+        description="What is kept. auto is the box of the thing that was walked round, with what "
+        "it stands on; where there is no such thing all is kept, with a warning. The report says "
+        "which box it was.",
+    )
     center: tuple[_World, _World, _World] = Field(
         (0.0, 0.0, 0.0), description="Its middle, x, y and z. Unit: the frame's."
     )

@@ -153,7 +153,8 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     none in the crop.
     """
     # Imported where it runs: the API reads this file too.
-    from pipelines.exports.crop import crop_of, cropped, empty_crop, narrowed, surface_in
+    from pipelines.exports.chosen_crop import chosen_crop
+    from pipelines.exports.crop import cropped, empty_crop, narrowed, surface_in
     from pipelines.exports.cutting import cut_out
     from pipelines.exports.formats import glb
     from pipelines.exports.levels import levels_of, texture_px_of
@@ -161,6 +162,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.reduction import reduced
     from pipelines.exports.subject import find_subject
     from pipelines.exports.subject_files import as_dict, gaze_of, save_subject
+    from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
     from pipelines.exports.surface.refinement import refined
     from pipelines.exports.surface.shells import Subject, affordable, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
@@ -183,13 +185,16 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     )
     if not shells:
         raise _empty("no ray of the training views met a surface")
-    crop = place.crop(crop_of(options.crop))
+    known = known_depths(ctx.workspace, options.use_depth_maps)
+    crop, told_crop = chosen_crop(
+        options.crop, place, lambda: search_subject(scene, probes, known, ctx), ctx.logger
+    )
     surface_in(crop, probes, shells[-1].bounds, "mesh")
     kept = [(shell, narrowed(shell.bounds, crop)) for shell in shells]
     shells = [replace(shell, bounds=bounds) for shell, bounds in kept if bounds is not None]
-    known = known_depths(ctx.workspace, options.use_depth_maps)
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
-        store = render_views(scene, images, lenses, Path(folder), ctx, _RENDER_SHARE, known)
+        shares = (SEARCH_SHARE, _RENDER_SHARE)
+        store = render_views(scene, images, lenses, Path(folder), ctx, shares, known)
         asked, shells = (
             shells,
             affordable(
@@ -292,6 +297,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         "voxel": round(shells[0].voxel, 9),
         "coarser": coarser,
         "subject": subject,
+        "crop": told_crop,
         "bounds": shells[0].bounds.as_dict(),
         "shells": [
             {"voxel": round(shell.voxel, 9), **shell.bounds.as_dict()} for shell in shells[1:]

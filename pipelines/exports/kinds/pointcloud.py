@@ -79,10 +79,12 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     there is none in the crop.
     """
     # Imported where it runs: the API reads this file too.
-    from pipelines.exports.crop import crop_of, empty_crop, narrowed, surface_in
+    from pipelines.exports.chosen_crop import chosen_crop
+    from pipelines.exports.crop import empty_crop, narrowed, surface_in
     from pipelines.exports.formats.colmap import check_lenses
     from pipelines.exports.placement import placement_of
     from pipelines.exports.spacing import one_of_each_cube
+    from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
     from pipelines.exports.surface import cloud as clouds
     from pipelines.exports.surface.views import (
         known_depths,
@@ -101,7 +103,10 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     bounds = scene.bounds(reach_of(options), ctx.check_cancelled, probes)
     if subject is None or bounds is None:
         raise _empty("no ray of the training views met a surface")
-    crop = place.crop(crop_of(options.crop))
+    known = known_depths(ctx.workspace, options.use_depth_maps)
+    crop, told_crop = chosen_crop(
+        options.crop, place, lambda: search_subject(scene, probes, known, ctx), ctx.logger
+    )
     around = surface_in(crop, probes, bounds, "pointcloud")
     bounds = narrowed(bounds, crop) or bounds
     images = scene.training_images(_MAX_VIEWS)
@@ -110,9 +115,9 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         reached = crop.contains(around[bounds.contains(around)])
         pixels /= max(float(reached.mean()) if len(reached) else 0.0, _LEAST_SHARE)
     lenses = [lens_of_pixels(scene.lens_of(image), pixels) for image in images]
-    known = known_depths(ctx.workspace, options.use_depth_maps)
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".views-") as folder:
-        store = render_views(scene, images, lenses, Path(folder), ctx, _RENDER_SHARE, known)
+        shares = (SEARCH_SHARE, _RENDER_SHARE)
+        store = render_views(scene, images, lenses, Path(folder), ctx, shares, known)
         ctx.progress(_RENDER_SHARE, "gathering points")
         cloud = clouds.gather(store, bounds)
         if crop is not None:
@@ -140,6 +145,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         "formats": list(options.formats),
         "num_points": len(cloud),
         "num_views": len(images),
+        "crop": told_crop,
         "bounds": bounds.as_dict(),
     }
 

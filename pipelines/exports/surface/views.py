@@ -45,15 +45,18 @@ def render_views(
     lenses: Sequence[Pinhole],
     folder: Path,
     ctx: StageContext,
-    share: float,
+    shares: tuple[float, float],
     known: KnownDepths | None = None,
+    words: str = "view",
 ) -> ViewStore:
     """Depth views from the images' poses, each through its lens, in a store on disk.
 
-    folder: for the store. share: of the export's progress that this is. known: the capture's own
-    maps; what they say of an image is a view of its own beside the field's, with a vote of its own.
+    folder: for the store. shares: of the export's progress, before and after. known: the capture's
+    own maps; what they say of an image is a view of its own beside the field's, with a vote of its
+    own. words: what progress calls a view.
     """
     store = ViewStore(folder)
+    begin, end = shares
     started = time.monotonic()
     for done, (image, lens) in enumerate(zip(images, lenses, strict=True), start=1):
         view = scene.depth_view(lens, np.asarray(image.world_from_camera, np.float64))
@@ -62,7 +65,8 @@ def render_views(
         if told is not None:
             store.append(told)
         eta = (time.monotonic() - started) / done * (len(images) - done)
-        ctx.progress(share * done / len(images), f"view {done}/{len(images)}", eta)
+        made = begin + (end - begin) * done / len(images)
+        ctx.progress(made, f"{words} {done}/{len(images)}", eta)
     return store
 
 

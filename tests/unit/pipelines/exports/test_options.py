@@ -80,7 +80,7 @@ def test_an_export_has_exactly_the_formats_asked_for(
         ("mesh", {"crop": {"shape": "box", "size": [1.0, 0.0, 1.0]}}, "greater than 0"),
         ("mesh", {"crop": {"shape": "box", "rotation_deg": [0, 0, 400]}}, "or equal to 360"),
         ("pointcloud", {"crop": {"shape": "sphere", "radius": 0}}, "greater than 0"),
-        ("pointcloud", {"crop": {"shape": "cone"}}, "'none', 'box' or 'sphere'"),
+        ("pointcloud", {"crop": {"shape": "cone"}}, "'none', 'box', 'sphere' or 'auto'"),
     ],
 )
 def test_wrong_requests_are_refused_with_the_range(
