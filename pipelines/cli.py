@@ -41,12 +41,17 @@ FAILED, WRONG_COMMAND, INTERRUPTED = 1, 2, 130
 
 
 class ProgressLine:
-    """One line per stage, redrawn in place on a terminal; only ends are written elsewhere."""
+    """One line per stage, redrawn in place on a terminal; only ends are written elsewhere.
+
+    A stage may come to its end more than once, a part of it each time, and say the same there over
+    and over but for the seconds that are left: it is written when its words are new.
+    """
 
     def __init__(self, stage: Stage, stream: TextIO) -> None:
         self._name = stage.name
         self._stream = stream
         self._redraw = stream.isatty()
+        self._written: str | None = None
 
     def __call__(self, fraction: float, message: str, eta_s: float | None) -> None:
         left = "" if eta_s is None else f", {eta_s:.0f} s left"
@@ -54,7 +59,8 @@ class ProgressLine:
         if self._redraw:
             self._stream.write(f"\r\x1b[K{line[:110]}")
             self._stream.flush()
-        elif fraction >= 1.0:
+        elif fraction >= 1.0 and message != self._written:
+            self._written = message
             self._stream.write(line + "\n")
 
 

@@ -104,35 +104,39 @@ class _Bars:
 
 
 class _Lines:
-    """Plain lines: each change of a state, and now and then where a running stage is."""
+    """Plain lines: each change of a state, and now and then where the running stages are.
+
+    No line is said twice, whatever of the time that is left changed in it.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._states: dict[str, tuple[str, int]] = {}
+        self._said: dict[str, list[str]] = {}
         self._said_at = time.monotonic()
 
     def update(self, job: Job) -> None:
         """Say what is new."""
+        is_due = time.monotonic() - self._said_at >= PLAIN_EVERY_S
         for stage in job.stages:
             before = self._states.get(stage.name)
             now = (stage.state, stage.attempt)
             self._states[stage.name] = now
             if (now != before and stage.state not in ("blocked", "ready")) or (
-                stage.state == "running" and self._is_due()
+                stage.state == "running" and is_due
             ):
                 self._say(stage)
 
-    def _is_due(self) -> bool:
-        return time.monotonic() - self._said_at >= PLAIN_EVERY_S
-
     def _say(self, stage: Stage) -> None:
-        self._said_at = time.monotonic()
         parts = [f"{stage.name:<11}", stage.state]
         if stage.state == "running":
             parts += [f"{stage.progress:4.0%}", clean(stage.message)]
         if stage.attempt > 1:
             parts.append(f"attempt {stage.attempt}")
-        parts.append(_left(stage))
+        if parts == self._said.get(stage.name):
+            return
+        self._said_at, self._said[stage.name] = time.monotonic(), parts
+        parts = [*parts, _left(stage)]
         self._console.print(
             "  ".join(part for part in parts if part), highlight=False, soft_wrap=True
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.cli import main
+from pipelines.cli import ProgressLine, main
+from pipelines.registry import get_stage
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.captures.archives import nerfstudio_files, picture, write_zip
 from tests.unit.pipelines.tools.clips import make_clip
@@ -86,6 +88,19 @@ def test_errors_are_told_with_code_and_hint(
     assert "too_few_images" in capsys.readouterr().err
     assert main(["run", "train", str(tmp_path / "job")]) == 1
     assert "run ingest" in capsys.readouterr().err
+
+
+def test_an_end_is_written_once_where_there_is_no_terminal() -> None:
+    stream = io.StringIO()
+    told = ProgressLine(get_stage("evaluate"), stream)
+    told(0.5, "test photos", 9.0)
+    for left in (0.4, 0.3, 0.0, None):
+        told(1.0, "measuring floaters", left)
+    told(1.0, "test photos", None)
+    assert stream.getvalue().splitlines() == [
+        "evaluate    100% measuring floaters, 0 s left",
+        "evaluate    100% test photos",
+    ]
 
 
 def test_module_can_be_run() -> None:
