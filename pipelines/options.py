@@ -202,6 +202,11 @@ class DepthOptions(model_of(StereoConfig)):  # type: ignore[misc]
 class DraftOptions(ExtentOptions, TextureOptions):
     """The mesh from depth maps alone, before training."""
 
+    texture: Literal["photos", "none"] = Field(
+        "photos",
+        description="photos puts a picture on the mesh, made of the photos; none leaves it its "
+        "vertices' colours.",
+    )
     resolution: int = Field(
         160, ge=32, le=2048, description="Voxels along the longest side of the subject."
     )

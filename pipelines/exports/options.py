@@ -62,13 +62,16 @@ class ExtentOptions(StageOptions):
 class TextureOptions(StageOptions):
     """What a mesh is coloured with."""
 
-    texture: Literal["photos", "none"] = Field(
+    texture: Literal["photos", "field", "none"] = Field(
         "photos",
-        description="photos puts a picture on the mesh, made of the training photos; none leaves "
-        "it its vertices' colours.",
+        description="photos puts a picture on the mesh, made of the training photos; field one of "
+        "what short rays through its surface show of the trained scene, which has neither seams "
+        "nor anything that moved, and less detail; none leaves it its vertices' colours.",
     )
     texture_px: Literal[512, 1024, 2048, 4096, 8192] = Field(
-        4096, description="Largest side of that picture; it is no larger than the photos need."
+        4096,
+        description="Largest side of that picture; it is no larger than the photos need, or the "
+        "field, which knows no more than the pixels that it was trained on.",
     )
 
 

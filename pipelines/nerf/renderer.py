@@ -8,8 +8,9 @@ units, not z. Symbols: R rays, H and W of a picture.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -262,6 +263,17 @@ class Renderer:
         budget = PLAIN_BYTES.get(self._device.type, PLAIN_BYTES["cpu"])
         budget = int(budget * self._memory_share)
         return max(1, min(MAX_PLAIN_RAYS, budget // self._model.bytes_per_ray()))
+
+
+def seen_within(model: Model, near: float, far: float) -> Model:
+    """The same networks asked along short rays: nothing counts but what lies from near to far.
+
+    near, far: scene units. What of a ray goes on beyond `far` has the colour of its last sample.
+    The weights are shared, not copied.
+    """
+    short = copy.copy(model)
+    short.config = replace(model.config, near=near, far=far, background="last_sample")
+    return short
 
 
 def pixels_in_blocks(width: int, height: int, side: int) -> Tensor:

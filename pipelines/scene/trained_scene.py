@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from pipelines.errors import ExportError, PipelineError
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Appearance, Model
 from pipelines.nerf.options.render import RenderConfig
-from pipelines.nerf.renderer import RenderedImage, Renderer
+from pipelines.nerf.renderer import RenderedImage, Renderer, seen_within
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.training.checkpoint import load_model
 from pipelines.nerf.training.state import choose_device
@@ -106,6 +107,8 @@ class TrainedScene:
         self.cameras = cameras
         self.extras = extras
         self.renderer = Renderer(model, scene, config=render_config, memory_share=memory_share)
+        self._render_config = render_config or RenderConfig()
+        self._memory_share = memory_share
 
     @classmethod
     def load(
@@ -122,6 +125,13 @@ class TrainedScene:
     def bend(self) -> float | None:
         """Of the camera's curve, where pictures were brought to one light; else None."""
         return self.cameras.bend
+
+    @property
+    def trained_long_side_px(self) -> int:
+        """Of the pictures as they were trained on."""
+        largest = max(max(lens.width, lens.height) for lens in self.cameras.cameras)
+        width, height = (int(self.extras.get(side, largest)) for side in ("width", "height"))
+        return max(width, height)
 
     def training_images(self, at_most: int = 0) -> list[PosedImage]:
         """The images that were trained on, in the file's order; or so many, evenly picked."""
@@ -158,6 +168,34 @@ class TrainedScene:
             cameras = nerf_cameras([lens], [pose], self.scene)
             sized = cameras.resized(long_side) if long_side else cameras
             return self.renderer.render(sized, 0, appearance=appearance)
+
+    def short_rays(
+        self,
+        begins: Floats,
+        directions: Floats,
+        length: float,
+        on_part: Callable[[float], None] = lambda done: None,
+    ) -> RenderedImage:
+        """What short rays see, in the mean appearance: [R] in place of [H, W].
+
+        begins: [R, 3], world. directions: [R, 3], unit. length: world units; what a ray has not met
+        by then is of the colour that it ends in. on_part: told the share that is done; may raise.
+        """
+        length *= self.scene.scale
+        near = 1e-3 * length  # 0 is no place for samples that are spaced by disparity
+        with nerf_errors_as(ExportError):
+            renderer = Renderer(
+                seen_within(self.model, near, near + length),
+                self.scene,
+                engine=self.renderer.engine,
+                # Both look for surfaces along the whole of a ray, and coarsely.
+                config=replace(self._render_config, baked_cells=0, skip_below=0.0),
+                memory_share=self._memory_share,
+            )
+            starts = self.scene.scene_from_world(begins)
+            return renderer.render_rays(
+                starts.astype(np.float32), directions.astype(np.float32), progress=on_part
+            )
 
     def picture(self, lens: Pinhole, pose: Floats) -> NDArray[np.uint8]:
         """[H, W, 3] uint8: an undistorted picture."""

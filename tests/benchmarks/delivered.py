@@ -8,7 +8,8 @@ the export `mesh` does it, written as GLB, read back and cast at all held-out ca
 `assess` does, at the size at which `evaluate` judged the model: PSNR on covered pixels, beside the
 model's own on whole pictures. Vertex colours are those of the trained field. With `--scene`, the
 analytic scene that all the jobs were filmed from (`--frames`, `--long-side`, as of `geometry`), the
-F-score at 1 and 2 % of its size too.
+F-score at 1 and 2 % of its size too, and the mean error of the colours (0 to 1) of what lies within
+1 % of the true surface, against the scene's own there.
 """
 
 from __future__ import annotations
@@ -28,26 +29,45 @@ from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.reduction import reduced
 from pipelines.exports.texture.bake import texture_from_photos
+from pipelines.exports.texture.field import pixels_on, texture_from_field
 from pipelines.exports.texture.photos import Photos
 from pipelines.judging.asset_scores import mean_scores, score_view
 from pipelines.judging.asset_views import MeshCaster, Texture
 from pipelines.options import AssessOptions
 from pipelines.sample.film import LONG_SIDE_PX, NUM_FRAMES, phone_camera, walk
 from pipelines.sample.judge import judge_poses, judge_surface
+from pipelines.sample.scene import Scene, raycast, surface_distance
 from pipelines.sample.scenes.catalogue import TAKES
 from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.orientation import Similarity
+from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stages.assess import load_views
 from pipelines.workspace import Workspace
 from tests.benchmarks.machine import describe, heading
 from tests.benchmarks.tables import markdown_table, number, write_json
 
-HEADER = ("job", "mesh", "triangles", "MB", "F 1 %", "F 2 %", "covered", "mesh dB", "model dB", "s")
+HEADER = (
+    "job",
+    "mesh",
+    "triangles",
+    "MB",
+    "F 1 %",
+    "F 2 %",
+    "colour error",
+    "covered",
+    "mesh dB",
+    "model dB",
+    "s",
+)
 _SAMPLES = 2
+_COLORED_POINTS = 40_000
+_NEAR_SURFACE = 0.01
 
 
 @dataclass
 class Row:
-    """f_1, f_2: F-score at 1 and 2 %, None where no truth is known. wall_s: to make it."""
+    """f_1, f_2: F-score at 1 and 2 %; color_error: in [0, 1]; None where no truth is known. wall_s:
+    to make it."""
 
     job: str
     mesh: str
@@ -55,6 +75,7 @@ class Row:
     num_bytes: int
     f_1: float | None
     f_2: float | None
+    color_error: float | None
     coverage: float | None
     mesh_db: float | None
     model_db: float
@@ -77,18 +98,58 @@ def delivered(job: Workspace) -> TriangleMesh:
 def kinds_of(
     job: Workspace, mesh: TriangleMesh, triangles: int, texture_px: int
 ) -> Iterator[tuple[str, TriangleMesh | TexturedMesh]]:
-    """The mesh as it is, with fewer triangles, and painted, each with a name."""
+    """The mesh as it is, with fewer triangles, and painted from either source, each with a name."""
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
     shown = [image for image in cameras.images if image.split == "train"]
-    photos = Photos(job.images_root, shown, [cameras.cameras[image.camera] for image in shown])
+    lenses = [cameras.cameras[image.camera] for image in shown]
+    photos = Photos(job.images_root, shown, lenses)
+    scene = TrainedScene.load(job.stage("train") / "model.zip")
+
+    def from_field(shape: TriangleMesh) -> TexturedMesh:
+        pixel = pixels_on(shape, shown, lenses, scene.trained_long_side_px)
+        return texture_from_field(shape, scene.short_rays, pixel, texture_px)
+
     yield "full, vertex colours", mesh
     yield "full, photos", texture_from_photos(mesh, photos, texture_px)
+    yield "full, field", from_field(mesh)
     few = reduced(mesh, triangles)
     yield f"{triangles:,}, vertex colours", few
     yield f"{triangles:,}, photos", texture_from_photos(few, photos, texture_px)
+    yield f"{triangles:,}, field", from_field(few)
     tenth = reduced(mesh, len(mesh.faces) // 10)
     yield "a tenth, vertex colours", tenth
     yield "a tenth, photos", texture_from_photos(tenth, photos, texture_px)
+    yield "a tenth, field", from_field(tenth)
+
+
+def colors_off(
+    mesh: TriangleMesh | TexturedMesh, alignment: Similarity, scene: Scene, seed: int = 0
+) -> float:
+    """The mean error of a mesh's colours, evenly by area, where it lies near the true surface.
+
+    The scene's colour is what is met on the way inwards from just outside.
+    """
+    vertices = alignment.apply_to_points(mesh.vertices)
+    inside = scene.subject.contains(vertices)
+    faces = mesh.faces[inside[mesh.faces].all(axis=1)]
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    random = np.random.default_rng(seed)
+    which = random.choice(len(faces), _COLORED_POINTS, p=area / area.sum())
+    weights = random.dirichlet(np.ones(3), len(which))
+    points = np.einsum("nc,ncd->nd", weights, corners[which])
+    out = across[which] / area[which, None]
+    values = mesh.uv if isinstance(mesh, TexturedMesh) else mesh.colors
+    found = np.einsum("nc,ncd->nd", weights, values[faces[which]])
+    if isinstance(mesh, TexturedMesh):
+        found = Texture(mesh.uv, mesh.texture).colors(found, np.ones(len(found)))
+    near = _NEAR_SURFACE * scene.subject.size
+    starts = points + 1.5 * near * out
+    kept = (surface_distance(points, scene) <= near) & scene.room.contains(starts)
+    hits = raycast(starts[kept], -out[kept], scene)
+    met = hits.t <= 3.0 * near
+    return float(np.abs(found[kept] - np.clip(hits.color, 0.0, 1.0))[met].mean())
 
 
 def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Row]:
@@ -99,6 +160,10 @@ def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Ro
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
     made = kinds_of(job, delivered(job), given.triangles, given.texture_px)
     known: dict[int, tuple[float, float]] = {}
+    if given.scene:
+        take = TAKES[given.scene]
+        truth = walk(given.frames, phone_camera(given.long_side), take=take)
+        alignment = judge_poses(cameras, truth).alignment
     while True:
         begun = time.monotonic()
         kind = next(made, None)
@@ -127,11 +192,11 @@ def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Ro
             ]
         )
         if given.scene and len(mesh.faces) not in known:
-            take = TAKES[given.scene]
-            truth = walk(given.frames, phone_camera(given.long_side), take=take)
-            alignment = judge_poses(cameras, truth).alignment
             surface = judge_surface(mesh.vertices, mesh.faces, alignment, truth, take.scene)
             known[len(mesh.faces)] = (surface.f_score[0.01], surface.f_score[0.02])
+        color_error = None
+        if given.scene:
+            color_error = colors_off(mesh, alignment, take.scene)
         f_1, f_2 = known.get(len(mesh.faces), (None, None))
         coverage, mesh_db = scores["coverage"], scores["psnr"]
         yield Row(
@@ -141,6 +206,7 @@ def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Ro
             num_bytes,
             f_1,
             f_2,
+            color_error,
             coverage,
             mesh_db,
             metrics["psnr"],
@@ -157,6 +223,7 @@ def cells_of(row: Row) -> list[str]:
         number(row.num_bytes / 1e6, 1),
         number(row.f_1, 4),
         number(row.f_2, 4),
+        number(row.color_error, 4),
         number(row.coverage, 3),
         number(row.mesh_db),
         number(row.model_db),

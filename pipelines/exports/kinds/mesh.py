@@ -2,8 +2,8 @@
 
 All of them lie in one frame, the world of cameras.json unless another is asked for
 (`pipelines.exports.frame`); GLB and USDZ have +Y up.
-GLB, OBJ and USDZ have a texture from the training photos, PLY the field's colours on its vertices,
-STL is shape alone.
+GLB, OBJ and USDZ have a texture from the training photos or the trained field, PLY the field's
+colours on its vertices, STL is shape alone.
 """
 
 from __future__ import annotations
@@ -167,6 +167,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.surface.shells import Subject, affordable, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
     from pipelines.exports.texture.bake import painted
+    from pipelines.exports.texture.told import skin_told
     from pipelines.scene.depth_views import Pinhole
     from pipelines.scene.stereo_views import stereo_view
 
@@ -265,6 +266,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             options.model_copy(update={"texture_px": side}),
             ctx,
             (_REDUCE_SHARE + each * (level + 0.1), _REDUCE_SHARE + each * (level + 1)),
+            scene,
         )
 
     skin = paint(mesh, 0)
@@ -277,7 +279,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     for level, shape in enumerate(levels_of(mesh, options.lods, on_level), start=1):
         coarse, path = paint(shape, level), ctx.out / f"mesh-lod{level}.glb"
         glb.write_mesh(path, place.mesh(coarse), frame, style_of(options))
-        levels.append({"file": path.name, **_told(coarse)})
+        levels.append({"file": path.name, **skin_told(coarse)})
     ctx.progress(_TEXTURE_SHARE, "writing")
     _write(place.mesh(mesh), place.mesh(skin), options, ctx, frame)
     if thing is not None and subject is not None:
@@ -291,7 +293,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         "formats": list(options.formats),
         "method": method,
         "num_vertices": len(mesh.vertices),
-        **_told(skin),
+        **skin_told(skin),
         "levels": levels,
         "num_views": len(images),
         "voxel": round(shells[0].voxel, 9),
@@ -334,16 +336,6 @@ def _photo_side(lenses: Sequence[Intrinsics]) -> int:
     """The long side of the photos that refine the mesh, px."""
     squares = sum(min(lens.width, lens.height) / max(lens.width, lens.height) for lens in lenses)
     return min(_PHOTO_SIDE_PX, int((_PHOTOS_PX / squares) ** 0.5))
-
-
-def _told(skin: TriangleMesh | TexturedMesh) -> dict[str, Any]:
-    """What the report says of a delivered mesh."""
-    from pipelines.exports.mesh import TexturedMesh
-
-    return {
-        "texture_px": len(skin.texture) if isinstance(skin, TexturedMesh) else None,
-        "num_faces": len(skin.faces),
-    }
 
 
 def _write(

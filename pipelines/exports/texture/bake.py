@@ -8,10 +8,8 @@ keep their vertices' colours. Memory: one photo at a time and the picture itself
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
-import open3d
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -19,21 +17,19 @@ from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import TextureOptions
 from pipelines.exports.texture.charts import CELL_PX, Charts, Layout, TextureFull, cut, lay_out
 from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos
+from pipelines.exports.texture.field import pixels_on, texture_from_field
 from pipelines.exports.texture.levelling import levels
 from pipelines.exports.texture.photos import Photos, colors_at, softened
+from pipelines.exports.texture.texels import spread, texels_of
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _CHOICE_SHARE, _CUT_SHARE, _COPY_SHARE = 0.55, 0.65, 0.85
-_ROWS = 256
 _SPREAD_PX = 3
-
-# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
-_core: Any = open3d.core
-_tensor_geometry: Any = open3d.t.geometry
 
 
 def painted(
@@ -43,22 +39,31 @@ def painted(
     options: TextureOptions,
     ctx: StageContext,
     shares: tuple[float, float],
+    scene: TrainedScene | None = None,
 ) -> TriangleMesh | TexturedMesh:
     """The mesh of a stage, painted with some images of the capture where its options want that.
 
-    shares: of the stage's progress, before and after. A mesh of more faces than the texture has
-    room for stays as it is, with a warning.
+    shares: of the stage's progress, before and after. scene: what was trained, which the options
+    may want to paint with; the images are then those that it was trained on. A mesh of more faces
+    than the texture has room for stays as it is, with a warning.
     """
     if options.texture == "none":
         return mesh
     begin, end = shares
+
+    def on_progress(done: float) -> None:
+        ctx.progress(begin + (end - begin) * done, "painting", None)
+
     try:
-        return texture_from_photos(
-            mesh,
-            Photos(ctx.workspace.images_root, images, lenses),
-            options.texture_px,
-            lambda done: ctx.progress(begin + (end - begin) * done, "painting", None),
-        )
+        if options.texture == "field":
+            if scene is None:
+                raise ValueError("before training there is no field to paint with")
+            pixel = pixels_on(mesh, images, lenses, scene.trained_long_side_px)
+            return texture_from_field(
+                mesh, scene.short_rays, pixel, options.texture_px, on_progress
+            )
+        photos = Photos(ctx.workspace.images_root, images, lenses)
+        return texture_from_photos(mesh, photos, options.texture_px, on_progress)
     except TextureFull as error:
         ctx.logger.warning(
             "The mesh keeps the colours of its vertices: %s. Raise texture_px, or lower max_faces.",
@@ -153,48 +158,18 @@ def _level(
     shown = charts.photo[charts.face_chart] != NOBODY
     if not shown.any():
         return
-    faces = np.ascontiguousarray(charts.faces[shown], np.uint32)
-    flat = np.concatenate([layout.uv, np.zeros((len(layout.uv), 1))], axis=1)
-    scene = _tensor_geometry.RaycastingScene()
-    scene.add_triangles(_core.Tensor(flat.astype(np.float32)), _core.Tensor(faces))
+    faces = charts.faces[shown]
     steps = np.zeros(picture.shape, np.int16)
     covered = np.zeros(picture.shape[:2], np.bool_)
-    columns = np.arange(layout.side) + 0.5
-    last = int(np.ceil(layout.uv[:, 1].max())) + 1
-    for top in range(0, min(last, layout.side), _ROWS):
-        rows = np.arange(top, min(top + _ROWS, layout.side)) + 0.5
-        rays = np.zeros((len(rows), layout.side, 6), np.float32)
-        rays[..., 0], rays[..., 1] = columns[None, :], rows[:, None]
-        rays[..., 2], rays[..., 5] = 1.0, -1.0
-        found = scene.cast_rays(_core.Tensor(rays))
-        hit = np.isfinite(found["t_hit"].numpy())
-        corners = added[faces[found["primitive_ids"].numpy()[hit]]]
-        u, v = found["primitive_uvs"].numpy()[hit].T
-        weights = np.stack([1.0 - u - v, u, v], axis=1)
-        part = slice(top, top + len(rows))
-        values = np.rint(255.0 * np.einsum("nc,ncd->nd", weights, corners))
-        steps[part][hit] = np.clip(values, -255, 255).astype(np.int16)
-        covered[part] = hit
+    for texels in texels_of(layout.uv, faces, layout.side):
+        values = np.einsum("nc,ncd->nd", texels.weights, added[faces[texels.face]])
+        values = np.rint(255.0 * values)
+        steps[texels.rows][texels.covered] = np.clip(values, -255, 255).astype(np.int16)
+        covered[texels.rows] = texels.covered
         on_rows()
-    _spread(steps, covered, on_rows)
+    spread(steps, covered, _SPREAD_PX, on_rows)
     np.clip(picture + steps, 0, 255, out=steps)
     picture[:] = steps.astype(np.uint8)
-
-
-def _spread(
-    values: NDArray[np.int16], covered: NDArray[np.bool_], on_pass: Callable[[], None]
-) -> None:
-    """Carry values a few pixels beyond what is covered, in place."""
-    for _ in range(_SPREAD_PX):
-        for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            on_pass()
-            into, out = [slice(None)] * 2, [slice(None)] * 2
-            into[axis], out[axis] = (
-                (slice(1, None), slice(None, -1)) if step > 0 else (slice(None, -1), slice(1, None))
-            )
-            take = ~covered[tuple(into)] & covered[tuple(out)]
-            values[tuple(into)][take] = values[tuple(out)][take]
-            covered[tuple(into)] |= take
 
 
 def _fill_cells(picture: Bytes, charts: Charts, layout: Layout, colors: Floats) -> None:

@@ -55,28 +55,39 @@ def cut(faces: Ints, choice: Ints, places_of: Callable[[int, Ints], Floats]) -> 
 
     choice: [F], the photo of each face. places_of: where a photo shows some vertices, px.
     """
-    face_chart, photo = _pieces(faces, choice)
-    keys = face_chart[:, None].astype(np.int64) * (int(faces.max()) + 1) + faces
-    corners, flat = np.unique(keys, return_inverse=True)
-    chart = (corners // (int(faces.max()) + 1)).astype(np.int32)
-    vertex = (corners % (int(faces.max()) + 1)).astype(np.int32)
-    place = np.zeros((len(corners), 2))
+    face_chart, photo = pieces(neighbours_of(faces), choice)
+    cut_faces, vertex, chart = corners_of(faces, face_chart)
+    place = np.zeros((len(vertex), 2))
     by_photo = photo[chart]
     for index in np.unique(by_photo[by_photo != NOBODY]):
         mine = by_photo == index
         place[mine] = places_of(int(index), vertex[mine])
-    cut_faces = flat.reshape(-1, 3).astype(np.int32)
     return Charts(cut_faces, vertex, chart, photo, place, face_chart)
 
 
-def _pieces(faces: Ints, choice: Ints) -> tuple[Ints, Ints]:
-    """The chart of each face [F], and the photo of each chart [C]."""
-    across = neighbours_of(faces)
-    here = np.repeat(np.arange(len(faces)), 3)
+def corners_of(faces: Ints, face_chart: Ints) -> tuple[Ints, Ints, Ints]:
+    """Faces [F, 3] of corners, and each corner's vertex [U] and chart [U].
+
+    A vertex is one corner for each chart that it is in; corners are in the order of their charts.
+    """
+    count = int(faces.max()) + 1
+    corners, flat = np.unique(
+        face_chart[:, None].astype(np.int64) * count + faces, return_inverse=True
+    )
+    chart, vertex = np.divmod(corners, count)
+    return flat.reshape(-1, 3).astype(np.int32), vertex.astype(np.int32), chart.astype(np.int32)
+
+
+def pieces(across: Ints, choice: Ints) -> tuple[Ints, Ints]:
+    """The chart of each face [F], and the choice of each chart [C]; `NOBODY`'s are of one face.
+
+    across: [F, 3], as `neighbours_of` has it. choice: [F].
+    """
+    here = np.repeat(np.arange(len(across)), 3)
     there = across.reshape(-1)
     joined = (there >= 0) & (choice[here] == choice[there]) & (choice[here] != NOBODY)
     links = coo_array(
-        (np.ones(joined.sum(), np.int8), (here[joined], there[joined])), (len(faces), len(faces))
+        (np.ones(joined.sum(), np.int8), (here[joined], there[joined])), (len(across), len(across))
     )
     count, piece = connected_components(links, directed=False)
     photo = np.full(count, NOBODY, np.int32)

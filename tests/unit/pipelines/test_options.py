@@ -77,3 +77,11 @@ def test_options_of_a_stage_that_the_preset_leaves_out_are_refused(
     with pytest.raises(OptionsError, match="draft has no such stage") as caught:
         resolve_options("draft", given)
     assert sorted(path for path, _ in caught.value.errors) == paths
+
+
+def test_a_mesh_can_be_painted_with_the_field_and_a_draft_which_has_none_cannot() -> None:
+    assert resolve_options("preview", {"mesh": {"texture": "field"}})["mesh"]["texture"] == "field"
+    for stage in ("draft", "mesh"):
+        wrong = "field" if stage == "draft" else "paint"
+        with pytest.raises(OptionsError, match=rf"{stage}\.texture"):
+            resolve_options("preview", {stage: {"texture": wrong}})

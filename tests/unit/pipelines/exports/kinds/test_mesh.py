@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh
 from pipelines.exports.surface import poisson_solver, tsdf
 from pipelines.exports.texture import charts
+from pipelines.judging.asset_views import Texture
 from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
 from pipelines.workspace import Workspace
@@ -87,6 +89,33 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
         assert plain["texture_px"] is None
         assert not isinstance(read_mesh(job.stage("mesh") / "mesh.glb"), TexturedMesh)
         assert ("keeps the colours of its vertices" in caplog.text) == full
+
+
+def test_every_file_with_a_picture_can_have_it_from_the_field(job: Workspace) -> None:
+    wanted = {"formats": ("glb", "obj", "usdz", "ply"), "lods": 1, "max_faces": 1500}
+    messages: list[str] = []
+    hooks = RunHooks(on_progress=lambda fraction, message, eta_s: messages.append(message))
+    told = tiny_job.run_with(job, "mesh", hooks, texture="field", **wanted)["summary"]
+    assert messages.count("painting") > 10
+    folder = job.stage("mesh")
+    mesh, coarse = read_mesh(folder / "mesh.glb"), read_mesh(folder / "mesh-lod1.glb")
+    assert isinstance(mesh, TexturedMesh)
+    assert isinstance(coarse, TexturedMesh)
+    assert len(mesh.texture) == told["texture_px"]
+    assert told["texels_per_unit"] > 10.0
+    assert len(coarse.texture) <= 2048
+    plain = read_ply(folder / "mesh.ply")
+    assert plain.colors is not None
+    own = plain.colors[plain.faces].mean(axis=1) / 255.0
+    texture = Texture(mesh.uv, mesh.texture)
+    painted = texture.colors(mesh.uv[mesh.faces].mean(axis=1), np.ones(len(mesh.faces)))
+    assert len(painted) == len(own), "faces are in the same order"
+    assert np.abs(painted - own).mean() < 0.12, "the field's colours, as the vertices have them"
+    assert problems_of(folder / "mesh.glb") == []
+    with zipfile.ZipFile(folder / "mesh.obj.zip") as opened, opened.open("mesh.png") as file:
+        assert np.asarray(Image.open(file)).shape == mesh.texture.shape
+    with zipfile.ZipFile(folder / "mesh.usdz") as opened:
+        assert any(name.endswith((".png", ".jpg")) for name in opened.namelist())
 
 
 def test_the_mesh_has_the_triangles_asked_for_painted_all_the_same(job: Workspace) -> None:
@@ -184,15 +213,25 @@ def test_a_cancel_ends_the_stage(job: Workspace) -> None:
     assert not job.stage("mesh").exists()
 
 
-@pytest.mark.parametrize("part", ["fusing depth", "painting", "cutting out the subject"])
-def test_a_cancel_is_noticed_at_the_next_word_of_any_part(job: Workspace, part: str) -> None:
+@pytest.mark.parametrize(
+    ("part", "changes"),
+    [
+        ("fusing depth", {}),
+        ("painting", {}),
+        ("painting", {"texture": "field", "refine": "none"}),
+        ("cutting out the subject", {}),
+    ],
+)
+def test_a_cancel_is_noticed_at_the_next_word_of_any_part(
+    job: Workspace, part: str, changes: dict[str, Any]
+) -> None:
     messages: list[str] = []
     hooks = RunHooks(
         on_progress=lambda fraction, message, eta_s: messages.append(message),
         is_cancelled=lambda: part in messages,
     )
     with pytest.raises(Cancelled):
-        tiny_job.run_with(job, "mesh", hooks, lods=1)
+        tiny_job.run_with(job, "mesh", hooks, lods=1, **changes)
     assert messages.count(part) == 1, "it says no more after the cancel"
     assert not job.stage("mesh").exists()
 
