@@ -41,15 +41,17 @@ class ExtentOptions(StageOptions):
 
     extent: Literal["auto", "subject", "scene"] = Field(
         "auto",
-        description="subject is what lies within max_distance; scene also what lies beyond it, up "
-        "to far_distance, more coarsely. auto is scene.",
+        description="scene is all that lies within far_distance, more coarsely beyond "
+        "max_distance. subject is the thing that was walked round with what it stands on; else "
+        "what stands where the cameras look, or, with a warning, what lies within max_distance. "
+        "auto is scene.",
     )
     max_distance: float = Field(
         2.0,
         gt=0,
         le=1000,
-        description="How far the subject reaches from the cameras' focus, in units of the cameras' "
-        "mean distance to it.",
+        description="Up to where surfaces are as fine as asked for, from the cameras' focus, in "
+        "units of the cameras' mean distance to it.",
     )
     far_distance: float = Field(
         18.0,

@@ -127,6 +127,13 @@ class Thing:
     lift: float
     slab: float
 
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """[P], whether points [P, 3] belong to it or to what is kept of what carries it."""
+        kept = self.region.contains(points) & ~self.is_other(points)
+        if self.carried_by is not None:
+            kept &= self.carried_by.height(points) >= -self.slab
+        return kept
+
     def is_other(self, points: Floats) -> NDArray[np.bool_]:
         """[P], whether points [P, 3] belong to something else that stands beside it."""
         other: NDArray[np.bool_] = self.others.of(points) > 0

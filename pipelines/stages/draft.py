@@ -16,16 +16,19 @@ import numpy as np
 from PIL import Image
 
 from pipelines.errors import ExportError
+from pipelines.exports.cutting import cut_out
 from pipelines.exports.formats import glb
 from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import reach_of
+from pipelines.exports.subject import find_subject
+from pipelines.exports.subject_files import as_dict, gaze_of
 from pipelines.exports.surface.shells import find_shells, fuse_shells
 from pipelines.exports.texture.bake import painted
 from pipelines.judging.asset_views import MeshCaster, Texture
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.options import DraftOptions
-from pipelines.scene.bounds import bounds_of_views
+from pipelines.scene.bounds import SceneBounds, bounds_of_views
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_views import DepthView, Floats, Pinhole, ViewStore
@@ -67,6 +70,11 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
         )
     if len(mesh.faces) == 0:
         return _nothing(options, ctx, "no two depth maps agree on a surface")
+    subject = None
+    if options.extent == "subject":
+        mesh, subject = _alone(mesh, cameras, shells[0].bounds, ctx)
+        if len(mesh.faces) == 0:
+            return _nothing(options, ctx, "nothing is left of the subject")
     skin = _painted(mesh, maps, cameras, options, ctx)
     glb.write_mesh(ctx.out / "draft.glb", skin, Frame(metric=cameras.metric))
     _save_picture(ctx.out / "draft.jpg", skin, probes[len(probes) // 2], shells[0].bounds.focus)
@@ -74,8 +82,29 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
         "num_faces": len(mesh.faces),
         "num_views": len(views),
         "voxel": round(shells[0].voxel, 9),
+        "subject": subject,
         "bounds": shells[0].bounds.as_dict(),
     }
+
+
+def _alone(
+    mesh: TriangleMesh, cameras: CamerasFile, near: SceneBounds, ctx: StageContext
+) -> tuple[TriangleMesh, dict[str, Any]]:
+    """The thing in the mesh with what it stands on, and what is told of it.
+
+    All of the mesh where none is found.
+    """
+    lenses = [cameras.cameras[image.camera] for image in cameras.images]
+    decision = find_subject(
+        mesh.vertices,
+        mesh.faces,
+        gaze_of(list(cameras.images), lenses),
+        (near.focus, near.distance),
+    )
+    if decision.thing is None:
+        ctx.logger.warning("No subject was found; the draft is what lies within max_distance.")
+        return mesh, as_dict(decision)
+    return cut_out(mesh, decision.thing), as_dict(decision)
 
 
 def _nothing(options: DraftOptions, ctx: StageContext, why: str) -> dict[str, Any]:

@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 BRIEF = {
     **PLAIN,
     "frames": {"num_frames": 32},
-    "pointcloud": {"num_points": 5000, "extent": "subject"},
+    "pointcloud": {"num_points": 5000, "far_distance": 2.0},
 }
 
 REPORT_KEYS = (

@@ -64,8 +64,9 @@ class MeshOptions(CropOptions, TextureOptions):
         "auto",
         description="scene is all that lies within far_distance, more coarsely beyond "
         "max_distance. auto is scene, and where somebody walked round a thing also subject.glb: "
-        "that thing with what it stands on. subject is that thing alone as the mesh itself, or "
-        "what lies within max_distance where none is found. A crop overrides it.",
+        "that thing with what it stands on. subject is that thing alone as the mesh itself; else "
+        "what stands where the cameras look, or, with a warning, what lies within max_distance. "
+        "A crop overrides it.",
     )
 
     method: Literal["tsdf", "poisson"] = Field(

@@ -84,6 +84,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     from pipelines.exports.formats.colmap import check_lenses
     from pipelines.exports.placement import placement_of
     from pipelines.exports.spacing import one_of_each_cube
+    from pipelines.exports.subject_files import as_dict
     from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
     from pipelines.exports.surface import cloud as clouds
     from pipelines.exports.surface.views import (
@@ -99,14 +100,22 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     place = placement_of(options.frame, scene.cameras)
     ctx.progress(0.0, "looking for the scene's bounds")
     probes = scene.probe_views(ctx.check_cancelled)
-    subject = scene.bounds(options.max_distance, ctx.check_cancelled, probes)
+    near = scene.bounds(options.max_distance, ctx.check_cancelled, probes)
     bounds = scene.bounds(reach_of(options), ctx.check_cancelled, probes)
-    if subject is None or bounds is None:
+    if near is None or bounds is None:
         raise _empty("no ray of the training views met a surface")
     known = known_depths(ctx.workspace, options.use_depth_maps)
     crop, told_crop = chosen_crop(
         options.crop, place, lambda: search_subject(scene, probes, known, ctx), ctx.logger
     )
+    thing = subject = None
+    if crop is None and options.extent == "subject":
+        decision = search_subject(scene, probes, known, ctx, insist=True)
+        thing, subject = decision.thing, as_dict(decision)
+        if thing is None:
+            ctx.logger.warning("No subject was found; the cloud is what lies within max_distance.")
+        else:
+            crop = thing.region
     around = surface_in(crop, probes, bounds, "pointcloud")
     bounds = narrowed(bounds, crop) or bounds
     images = scene.training_images(_MAX_VIEWS)
@@ -120,15 +129,19 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         store = render_views(scene, images, lenses, Path(folder), ctx, shares, known)
         ctx.progress(_RENDER_SHARE, "gathering points")
         cloud = clouds.gather(store, bounds)
-        if crop is not None:
+        if thing is not None:
+            cloud = cloud.take(thing.holds(cloud.points))
+        elif crop is not None:
             cloud = cloud.take(crop.contains(cloud.points))
         ctx.progress(0.8, f"checking {len(cloud)} points against all views")
         cloud = cloud.take(consistent(cloud.points, store))
     if options.remove_outliers:
         ctx.progress(0.87, "removing outliers")
-        inner = subject.contains(cloud.points)
+        inner = near.contains(cloud.points)
         parts = [cloud.take(inner), cloud.take(~inner)]  # what is far is spread more widely
         cloud = clouds.joined([clouds.without_outliers(part, bounds.focus) for part in parts])
+    if len(cloud) == 0 and thing is not None:
+        raise _empty("no two views agree on a surface of the subject")
     if len(cloud) == 0 and crop is not None:
         raise empty_crop(crop, around, "pointcloud")
     if len(cloud) == 0:
@@ -145,6 +158,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         "formats": list(options.formats),
         "num_points": len(cloud),
         "num_views": len(images),
+        "subject": subject,
         "crop": told_crop,
         "bounds": bounds.as_dict(),
     }
@@ -191,7 +205,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=5,
+    version=6,
     reads=("depth",),
     run=run,
     options=PointcloudOptions,

@@ -170,3 +170,20 @@ def test_what_stands_beside_a_thing_in_its_region_is_cut_off_it() -> None:
     kept = {tuple(place) for place in np.round(cut.vertices, 9)}
     assert {tuple(place) for place in np.round(body, 9)} <= kept
     assert cut.vertices[:, 2].max() <= 0.3 + 1e-9, "the post is higher"
+
+
+def test_points_are_a_things_own_where_its_cut_would_keep_them() -> None:
+    under = table(2.0, height=-0.5)
+    post = block((0.30, -0.01, 0.0), (0.31, 0.01, 0.9))
+    mesh = joined([table(2.0), block((-0.2, -0.15, 0.0), (0.2, 0.15, 0.3)), post, under])
+    gaze = seen_from(around(360.0, radius=0.8), (0.0, 0.0, 0.15))
+    thing = find_subject(mesh.vertices, mesh.faces, gaze).thing
+    assert thing is not None
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    held = of_faces(mesh, thing.holds(middles))
+    cut = cut_out(mesh, thing)
+    # Triangles across the box's sides go with their middles, or are cut.
+    assert _area(held) == pytest.approx(_area(cut), rel=0.03)
+    assert thing.region.contains(held.vertices * 0.9).all()
+    assert (held.vertices[:, 2] < 0.3 + 1e-9).all(), "the post is higher"
+    assert (held.vertices[:, 2] > -0.2).all(), "what is far below the table is not its top"

@@ -11,6 +11,10 @@ import pytest
 from PIL import Image
 
 from pipelines.errors import Cancelled, TrainingError
+from pipelines.exports import subject
+from pipelines.exports.crop import crop_of
+from pipelines.exports.formats.glb import read_mesh
+from pipelines.exports.options import CropShapeOptions
 from pipelines.exports.texture.photos import Photos
 from pipelines.manifest import RunHooks
 from pipelines.nerf.data.light import exposed
@@ -115,6 +119,26 @@ def test_the_draft_is_a_mesh_where_the_scene_is(mapped: Workspace) -> None:
         shown = np.asarray(picture.convert("RGB")).astype(int)
     assert (np.abs(shown - 128).max(axis=-1) > 8).mean() > 0.2, "a picture of nothing"
     assert summary["num_views"] == 19
+
+
+def test_a_subject_asked_for_is_cut_out_of_the_draft(
+    mapped: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rough = {"resolution": 96, "texture": "none"}
+    whole = tiny_job.run(mapped, "draft", far_distance=2.0, **rough)["summary"]
+    assert whole["subject"] is None
+    told = tiny_job.run(mapped, "draft", extent="subject", **rough)["summary"]
+    assert told["subject"]["kind"] == "subject", told["subject"]
+    assert 100 < told["num_faces"] < 0.9 * whole["num_faces"]
+    box = crop_of(CropShapeOptions(shape="box", **told["subject"]["region"]))
+    assert box is not None
+    drafted = read_mesh(mapped.stage("draft") / "draft.glb")
+    assert box.distance(drafted.vertices).max() < 1e-4
+    assert len(drafted.faces) == told["num_faces"]
+    monkeypatch.setattr(subject, "LEAST_STANDING", 1e9)
+    none = tiny_job.run(mapped, "draft", extent="subject", **rough)["summary"]
+    assert (none["num_faces"], none["subject"]["region"]) == (whole["num_faces"], None)
+    assert "No subject was found" in caplog.text
 
 
 def test_without_maps_there_is_no_draft_and_training_goes_on(tmp_path: Path) -> None:

@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.errors import ExportError
+from pipelines.exports import subject
+from pipelines.exports.crop import crop_of
+from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
+from pipelines.exports.options import CropShapeOptions
 from pipelines.registry import get_stage
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
@@ -92,3 +96,46 @@ def test_points_keep_the_spacing_asked_for_and_face_the_cameras(job: Workspace) 
     assert cloud.normals is not None
     towards = np.einsum("pc,pec->pe", cloud.normals, eyes[None] - cloud.points[:, None])
     assert (towards > 0).any(axis=1).mean() > 0.99, "some camera is in front of each point"
+
+
+def test_a_subject_asked_for_is_the_thing_that_the_mesh_has(job: Workspace) -> None:
+    whole = tiny_job.run(job, "pointcloud")["summary"]
+    assert whole["subject"] is None
+    before = read_ply(job.stage("pointcloud") / "pointcloud.ply").points
+    told = tiny_job.run(job, "pointcloud", extent="subject")["summary"]
+    assert told["subject"]["kind"] == "subject", told["subject"]
+    points = read_ply(job.stage("pointcloud") / "pointcloud.ply").points.astype(np.float64)
+    region = told["subject"]["region"]
+    box = crop_of(CropShapeOptions(shape="box", **region))
+    assert box is not None
+    assert box.distance(points).max() < 1e-4
+    inside = box.contains(before.astype(np.float64)).sum()
+    assert inside < 0.9 * len(before)
+    assert len(points) > 1.2 * inside, "the points that are wanted are looked for in the thing"
+    mesh = tiny_job.run(job, "mesh", extent="subject", texture="none")["summary"]["subject"]
+    other = crop_of(CropShapeOptions(shape="box", **mesh["region"]))
+    assert other is not None
+    for one, two in ((box, other), (other, box)):
+        filled = (
+            one.center + np.random.default_rng(0).uniform(-1, 1, (999, 3)) * one.half @ one.axes.T
+        )
+        assert two.contains(filled).mean() > 0.75
+    off, _ = cKDTree(read_mesh(job.stage("mesh") / "mesh.glb").vertices).query(points)
+    assert np.median(off) < 0.08 * max(region["size"])
+    # A crop says what is kept: nothing else is decided.
+    crop = {"shape": "box", **region}
+    cropped = tiny_job.run(job, "pointcloud", extent="subject", crop=crop)["summary"]
+    assert cropped["subject"] is None
+
+
+def test_without_a_subject_it_is_what_lies_near(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(subject, "LEAST_STANDING", 1e9)
+    near = {"max_distance": 0.9}
+    told = tiny_job.run(job, "pointcloud", extent="subject", **near)["summary"]
+    assert (told["subject"]["kind"], told["subject"]["region"]) == ("scene", None)
+    assert "No subject was found" in caplog.text
+    alone = (job.stage("pointcloud") / "pointcloud.ply").read_bytes()
+    tiny_job.run(job, "pointcloud", far_distance=0.9, **near)
+    assert (job.stage("pointcloud") / "pointcloud.ply").read_bytes() == alone
