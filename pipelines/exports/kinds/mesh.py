@@ -38,6 +38,8 @@ _FILES: dict[Format, str] = {
     "stl": "mesh.stl",
     "usdz": "mesh.usdz",
 }
+_TEXTURED = frozenset({"glb", "obj", "usdz"})
+"""Formats that carry a texture."""
 _RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
 _REFINE_SHARE, _REDUCE_SHARE, _TEXTURE_SHARE = 0.83, 0.86, 0.96
 _SUBJECT_SHARE = 0.98
@@ -270,7 +272,10 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             scene,
         )
 
-    skin = paint(mesh, 0)
+    # Without a texture to deliver there is none to be judged by either.
+    textured = not _TEXTURED.isdisjoint(options.formats)
+    skin = paint(mesh, 0) if textured or thing is not None else mesh
+    delivered = skin if textured else mesh
     levels: list[dict[str, Any]] = []
 
     def on_level(done: float) -> None:
@@ -282,7 +287,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         glb.write_mesh(path, place.mesh(coarse), frame, style_of(options))
         levels.append({"file": path.name, **skin_told(coarse)})
     ctx.progress(_TEXTURE_SHARE, "writing")
-    _write(place.mesh(mesh), place.mesh(skin), options, ctx, frame)
+    _write(place.mesh(mesh), place.mesh(delivered), options, ctx, frame)
     if thing is not None and subject is not None:
         ctx.progress(_SUBJECT_SHARE, "cutting out the subject")
         metric, style = scene.cameras.metric, style_of(options)
@@ -294,7 +299,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         "formats": list(options.formats),
         "method": method,
         "num_vertices": len(mesh.vertices),
-        **skin_told(skin),
+        **skin_told(delivered),
         "levels": levels,
         "num_views": len(images),
         "voxel": round(shells[0].voxel, 9),
@@ -375,7 +380,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="mesh",
-    version=10,
+    version=11,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

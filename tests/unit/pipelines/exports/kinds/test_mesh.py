@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from pipelines.errors import Cancelled, ExportError
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
-from pipelines.exports.mesh import TexturedMesh
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.surface import poisson_solver, tsdf
 from pipelines.exports.texture import charts
 from pipelines.judging.asset_views import Texture
@@ -57,6 +57,29 @@ def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
     assert len(judged.faces) == manifest["summary"]["num_faces"]
     film = tiny_job.run(job, "meshvideo", num_frames=8)
     assert film["summary"]["num_frames"] == 8
+
+
+def test_nothing_is_painted_where_no_file_carries_a_texture(job: Workspace) -> None:
+    """It is judged by the colours that its vertices have, which are those of PLY."""
+    for formats, extent, painted in (
+        (("stl", "ply"), "scene", False),
+        (("stl", "ply"), "auto", True),  # for subject.glb
+        (("stl", "obj"), "scene", True),
+    ):
+        told: list[str] = []
+        hooks = RunHooks(on_progress=lambda fraction, message, eta_s, to=told: to.append(message))
+        manifest = tiny_job.run_with(job, "mesh", hooks, formats=formats, extent=extent)
+        assert ("painting" in told) == painted, formats
+        judged = read_mesh(job.stage("mesh") / "judged.glb")
+        textured = "obj" in formats
+        assert isinstance(judged, TexturedMesh) == textured
+        assert (manifest["summary"]["texture_px"] is not None) == textured
+        if isinstance(judged, TriangleMesh):
+            colors = read_ply(job.stage("mesh") / "mesh.ply").colors
+            assert colors is not None
+            np.testing.assert_allclose(255.0 * judged.colors, colors, atol=1.0)
+        if extent == "auto":
+            assert isinstance(read_mesh(job.stage("mesh") / "subject.glb"), TexturedMesh)
 
 
 def test_there_is_a_mesh_also_where_the_solver_fails(
