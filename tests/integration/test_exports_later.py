@@ -1,0 +1,151 @@
+"""Real exports through a real worker, months later: the capture is deleted, the machine another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.nerf.engines.cpu.parts.runtime import CACHE_FOLDER
+from pipelines.registry import STAGES, get_stage
+from pipelines.workspace import Workspace
+from storage.claims import claim_stage
+from storage.deletions import drain_deletions
+from storage.exports import create_export, open_for_export
+from storage.jobs import StageSeed, create_job, ready_stage_ids, stage_id
+from storage.keys import attempt_prefix, blob_content
+from storage.leases import succeed_stage
+from storage.models import Job, new_id
+from storage.records import create_capture, delete_capture
+from storage.tenants import DEFAULT_TENANT
+from tests.integration.engine import Engine
+from tests.services import RedisServer, S3Endpoint
+from tests.unit.pipelines.stages import tiny_job
+from worker.transfer import upload_folder
+
+pytestmark = [pytest.mark.services, pytest.mark.timeout(600)]
+
+SEED = 3
+"""That of `tiny_job.run`, whose files are those that are wanted."""
+MADE = ("ingest", "train")
+WANTED: dict[str, dict[str, Any]] = {
+    "mesh": {"crop": {"shape": "auto"}},
+    "pointcloud": {"extent": "subject", "formats": ["ply", "xyz"]},
+    "cameras": {},
+}
+
+
+@pytest.fixture
+def engine(
+    tmp_path: Path, redis_server: RedisServer, postgres_url: str, s3_endpoint: S3Endpoint
+) -> Iterator[Engine]:
+    """On PostgreSQL and S3, with the stages of people's jobs, and kernels that are compiled."""
+    parts = {
+        **s3_endpoint.environment(),
+        "NERFWORKS_DATABASE_URL": postgres_url,
+        "NERFWORKS_REGISTRY": "pipelines.registry",
+        "NUMBA_CACHE_DIR": str(CACHE_FOLDER.parent),
+        "NERFWORKS_WORKER_STAGE_WRITABLE": str(CACHE_FOLDER.parent),
+    }
+    made = Engine(tmp_path, redis_server.url, **parts)
+    yield made
+    made.close()
+
+
+def _publish(engine: Engine, job: Job, name: str, workspace: Workspace) -> None:
+    """What the worker that made a stage did with its folder."""
+    with engine.database.session_scope() as session:
+        claim = claim_stage(session, stage_id(job.id, name), "first", 60.0)
+    assert claim is not None
+    prefix = attempt_prefix(job.object_root, name, claim.attempt, claim.token)
+    upload_folder(
+        engine.store, workspace.stage(name), prefix, lambda: None, workers=2, step="publish"
+    )
+    with engine.database.session_scope() as session:
+        manifest = workspace.manifest(name)
+        succeed_stage(session, claim, manifest=manifest, output_prefix=prefix)
+
+
+def _trained_job(engine: Engine, workspace: Workspace) -> str:
+    """A job of which nothing is left but what its stages published: its capture is deleted."""
+    source = engine.folder / "tiny.zip"
+    source.write_bytes(b"tiny")
+    capture_id = new_id()
+    key = blob_content(DEFAULT_TENANT, "0" * 64, capture_id)
+    engine.store.put_file(key, source)
+    with engine.database.session_scope() as session:
+        create_capture(
+            session,
+            capture_id=capture_id,
+            filename=source.name,
+            kind="nerfstudio",
+            num_bytes=4,
+            sha256="0" * 64,
+            brought=key,
+            details={},
+        )
+        job = create_job(
+            session,
+            capture_id=capture_id,
+            preset="preview",
+            preset_reason="test",
+            options={stage.name: tiny_job.options_of(stage.name) for stage in STAGES},
+            stages=[
+                StageSeed(stage.name, stage.after, skipped=stage.name not in MADE)
+                for stage in STAGES
+            ],
+            seed=SEED,
+        )
+    for name in MADE:
+        _publish(engine, job, name, workspace)
+    with engine.database.session_scope() as session:
+        delete_capture(session, capture_id)
+    drain_deletions(engine.database, engine.store)
+    assert not engine.store.exists(key)
+    return job.id
+
+
+def _ask(engine: Engine, job_id: str, kind: str, changes: dict[str, Any]) -> str:
+    options = tiny_job.options_of(kind, **changes)
+    with engine.database.session_scope() as session:
+        made = create_export(session, open_for_export(session, job_id), kind, options)
+        ready = ready_stage_ids(made)
+    engine.bell.ring(ready)
+    return made.id
+
+
+def test_what_is_asked_for_later_is_what_the_job_would_have_made(
+    engine: Engine, tmp_path: Path
+) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "first machine")
+    tiny_job.run(workspace, "train")
+    job_id = _trained_job(engine, workspace)
+    engine.start_worker()
+    asked = {kind: _ask(engine, job_id, kind, changes) for kind, changes in WANTED.items()}
+    elsewhere = {"crop": {"shape": "sphere", "center": [0.0, 0.0, 300.0], "radius": 1.0}}
+    nowhere = _ask(engine, job_id, "mesh", elsewhere)
+    for kind, changes in WANTED.items():
+        tiny_job.run(workspace, kind, **changes)
+        at_once = workspace.manifest(kind)
+        over = engine.wait_for(asked[kind], "succeeded", "failed", timeout_s=300)
+        assert over.state == "succeeded", over.error
+        row = engine.stage(asked[kind], kind)
+        assert row.manifest is not None
+        assert row.output_prefix is not None
+        assert row.manifest["files"] == at_once["files"], kind
+        assert row.manifest["fingerprint"] == at_once["fingerprint"]
+        assert row.summary == at_once["summary"]
+        stored = {
+            key.removeprefix(row.output_prefix) for key in engine.store.list(over.object_root)
+        }
+        names = {file["path"] for file in at_once["files"]}
+        assert stored == names | {"manifest.json"}
+        assert names & {artifact.path for artifact in get_stage(kind).artifacts}
+
+    failed = engine.wait_for(nowhere, "succeeded", "failed", timeout_s=60)
+    assert failed.error is not None
+    assert failed.error["code"] == "export.empty"
+    assert engine.stage(nowhere, "mesh").output_prefix is None
+    assert list(engine.store.list(failed.object_root)) == [], "nothing half-written is listed"
