@@ -197,6 +197,19 @@ class TrainedScene:
                 starts.astype(np.float32), directions.astype(np.float32), progress=on_part
             )
 
+    def density(self, points: Floats) -> NDArray[np.float32]:
+        """The trained density [N] per world unit at points [N, 3] of the world."""
+        device, engine = next(self.model.parameters()).device, self.model.engine
+        places = torch.as_tensor(self.scene.scene_from_world(points), dtype=torch.float32)
+        self.model.set_engine("fast" if device.type == "cpu" else engine)
+        try:
+            with torch.no_grad(), nerf_errors_as(ExportError):
+                found = self.model.density(places.to(device)).float().cpu().numpy()
+        finally:
+            self.model.set_engine(engine)
+        dense: NDArray[np.float32] = found * np.float32(self.scene.scale)
+        return dense
+
     def picture(self, lens: Pinhole, pose: Floats) -> NDArray[np.uint8]:
         """[H, W, 3] uint8: an undistorted picture."""
         return as_uint8(self.render(lens.intrinsics(), pose).rgb)

@@ -71,11 +71,19 @@ class MeshOptions(CropOptions, TextureOptions):
         "A crop overrides it.",
     )
 
-    method: Literal["tsdf", "poisson"] = Field(
+    method: Literal["tsdf", "poisson", "marching_cubes"] = Field(
         "tsdf",
         description="How depth becomes a surface: tsdf fuses it in a field of voxels; poisson lays "
         "a smooth surface through the points that views agree on, closes small holes, and takes "
-        "longer; where its solver fails, tsdf is what is done.",
+        "longer; where its solver fails, tsdf is what is done. marching_cubes takes the trained "
+        "density itself at density_level, near what the views see.",
+    )
+    density_level: float = Field(
+        0.5,
+        ge=0.01,
+        le=0.99,
+        description="Where the surface of method=marching_cubes is: of the light that goes through "
+        "a voxel's length there, this share is taken away. Lower is farther out.",
     )
     resolution: int = Field(
         256,
@@ -211,7 +219,9 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         method: Method = options.method
         told = _part_of(ctx, "fusing depth", _AFFORD_SHARE, _FUSE_SHARE)
         try:
-            mesh = fuse_shells(store, shells, options.max_faces, told, method)
+            mesh = fuse_shells(
+                store, shells, options.max_faces, told, method, scene.density, options.density_level
+            )
         except ToolError as error:
             if method != "poisson":
                 raise

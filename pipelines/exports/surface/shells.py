@@ -14,12 +14,13 @@ from typing import Literal
 
 from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.surface.clean import clean
+from pipelines.exports.surface.isosurface import LEVEL, Density, extract
 from pipelines.exports.surface.poisson import reconstruct
 from pipelines.exports.surface.tsdf import Blocks, affordable_blocks, fuse
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.depth_views import DepthView, ViewStore
 
-Method = Literal["tsdf", "poisson"]
+Method = Literal["tsdf", "poisson", "marching_cubes"]
 REACH = 3.0
 _MIN_GROWTH = 1.2
 """What is hardly larger than the shell in it shows nothing new and is left out."""
@@ -124,12 +125,15 @@ def fuse_shells(
     max_faces: int,
     on_progress: Callable[[float], None] = lambda fraction: None,
     method: Method = "tsdf",
+    density: Density | None = None,
+    level: float = LEVEL,
 ) -> TriangleMesh:
     """All shells fused and cleaned, as one mesh; may be without vertices.
 
     max_faces: of each shell up to `max_distance`; those beyond have at most a quarter of it.
     on_progress: told the share that is done; may raise. method: how a shell's surface is made of
-    the views.
+    the views. density, level: the field of `marching_cubes`, and where its surface is
+    (`isosurface.extract`).
     """
     pieces = []
     for index, shell in enumerate(shells):
@@ -142,6 +146,12 @@ def fuse_shells(
 
         if method == "poisson":
             fused = reconstruct(views, shell.bounds, shell.voxel, on_fused)
+        elif method == "marching_cubes":
+            if density is None:
+                raise ValueError("marching_cubes is done on a density field")
+            fused = extract(
+                density, views, shell.bounds, shell.voxel, on_fused, shell.blocks, level
+            )
         else:
             fused = fuse(views, shell.bounds, shell.voxel, on_fused, shell.blocks)
         if index:

@@ -68,7 +68,7 @@ def affordable_blocks(
         def on_share(done: float, before: float = left) -> None:
             on_progress(1.0 - before + 0.5 * before * done)
 
-        most, grid = _MANY * MOST_BLOCKS, _grid(voxel, 1)
+        most, grid = _MANY * MOST_BLOCKS, voxel_grid(voxel, 1)
         blocks = _blocks_near_surface(grid, views, bounds, origin, on_share, most)
         if len(blocks) <= MOST_BLOCKS:
             return voxel, blocks
@@ -88,7 +88,7 @@ def _blocks_of_box(bounds: SceneBounds, voxel: float) -> float:
     return float(np.prod(np.ceil(sides)))
 
 
-def _grid(voxel: float, num_blocks: int) -> Any:
+def voxel_grid(voxel: float, num_blocks: int) -> Any:
     """Open3D's grid with room for so many blocks; it takes a larger copy where it needs more."""
     return _tensor_geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight", "color"),
@@ -121,10 +121,10 @@ def fuse(
         on_progress(_FIND_SHARE * done)
 
     if blocks is None:
-        blocks = _blocks_near_surface(_grid(voxel, 1), views, bounds, origin, on_found)
+        blocks = touched_blocks(views, bounds, voxel, on_found)
     if len(blocks) == 0:
         return empty_mesh()
-    grid = _grid(voxel, len(blocks))
+    grid = voxel_grid(voxel, len(blocks))
     keys = _core.Tensor(blocks)
     for done, view in enumerate(views, start=1):
         depth = np.where(view.smooth_mask(), view.z_depth, 0.0).astype(np.float32)
@@ -153,6 +153,17 @@ def fuse(
 def _farthest(view: DepthView) -> float:
     """A depth behind every pixel of the view."""
     return float(view.z_depth.max()) * 1.01 + 1e-6
+
+
+def touched_blocks(
+    views: Sized,
+    bounds: SceneBounds,
+    voxel: float,
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> Blocks:
+    """All blocks near any view's surface inside the bounds. on_progress: as of `fuse`."""
+    origin = (bounds.box_min + bounds.box_max) / 2.0
+    return _blocks_near_surface(voxel_grid(voxel, 1), views, bounds, origin, on_progress)
 
 
 def _blocks_near_surface(

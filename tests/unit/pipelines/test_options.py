@@ -85,3 +85,13 @@ def test_a_mesh_can_be_painted_with_the_field_and_a_draft_which_has_none_cannot(
         wrong = "field" if stage == "draft" else "paint"
         with pytest.raises(OptionsError, match=rf"{stage}\.texture"):
             resolve_options("preview", {stage: {"texture": wrong}})
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"method": "cubes"}, {"density_level": 0.0}, {"density_level": 1.0}]
+)
+def test_a_surface_of_the_density_is_somewhere_within_it(wrong: dict[str, Any]) -> None:
+    given = {"method": "marching_cubes", "density_level": 0.9}
+    assert resolve_options("preview", {"mesh": given})["mesh"]["density_level"] == 0.9
+    with pytest.raises(OptionsError, match=f"mesh.{next(iter(wrong))}"):
+        resolve_options("preview", {"mesh": wrong})

@@ -141,6 +141,33 @@ def test_every_file_with_a_picture_can_have_it_from_the_field(job: Workspace) ->
         assert any(name.endswith((".png", ".jpg")) for name in opened.namelist())
 
 
+def test_marching_cubes_find_the_field_where_its_depth_is_and_a_crop_holds(job: Workspace) -> None:
+    plain = {"refine": "none", "texture": "none", "extent": "scene"}
+    faint = {"method": "marching_cubes", "density_level": 0.1}  # so little training leaves fog
+    fused = tiny_job.run(job, "mesh", **plain)["summary"]
+    depth = read_ply(job.stage("mesh") / "mesh.ply")
+    told = tiny_job.run(job, "mesh", **plain, **faint)["summary"]
+    assert told["method"] == "marching_cubes"
+    field = read_ply(job.stage("mesh") / "mesh.ply")
+    assert len(field.faces) > 500
+    off, _ = cKDTree(depth.points).query(field.points)
+    assert np.median(off) < 2.0 * fused["voxel"]
+    assert field.colors is not None
+    assert field.colors.std() > 5.0
+    low, high = np.percentile(field.points, (20, 80), axis=0)
+    crop = {"shape": "box", "center": ((low + high) / 2).tolist(), "size": (high - low).tolist()}
+    wanted = plain | faint | {"texture": "field"}
+    few = tiny_job.run(job, "mesh", crop=crop, **wanted)["summary"]
+    cut = read_mesh(job.stage("mesh") / "mesh.glb")
+    assert isinstance(cut, TexturedMesh)
+    assert 20 < len(cut.faces) == few["num_faces"] < len(field.faces)
+    assert (cut.vertices > low - 1e-4).all()
+    assert (cut.vertices < high + 1e-4).all()
+    with pytest.raises(ExportError) as caught:
+        tiny_job.run(job, "mesh", crop=crop | {"center": (1e5, 0.0, 0.0)}, **wanted)
+    assert caught.value.code == "export.empty"
+
+
 def test_the_mesh_has_the_triangles_asked_for_painted_all_the_same(job: Workspace) -> None:
     before = tiny_job.run(job, "mesh")["summary"]
     full = read_ply(job.stage("mesh") / "mesh.ply")
@@ -240,6 +267,7 @@ def test_a_cancel_ends_the_stage(job: Workspace) -> None:
     ("part", "changes"),
     [
         ("fusing depth", {}),
+        ("fusing depth", {"method": "marching_cubes"}),
         ("painting", {}),
         ("painting", {"texture": "field", "refine": "none"}),
         ("cutting out the subject", {}),

@@ -174,7 +174,7 @@ def test_voxels_are_as_large_as_memory_wants_and_no_larger(
     bounds, fine = bounds_around(CENTER), 2.6 / 256
 
     def num_blocks(voxel: float) -> int:
-        grid, origin = tsdf._grid(voxel, 1), (bounds.box_min + bounds.box_max) / 2.0
+        grid, origin = tsdf.voxel_grid(voxel, 1), (bounds.box_min + bounds.box_max) / 2.0
         return len(tsdf._blocks_near_surface(grid, views, bounds, origin))
 
     everything = num_blocks(fine)

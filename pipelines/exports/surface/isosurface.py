@@ -1,0 +1,149 @@
+"""The surface of a trained density field: where a voxel's length takes away half of the light.
+
+The field is asked at voxels near what the views see, in blocks, so that memory is bounded and what
+no camera looks at is left out; marching cubes (Lorensen and Cline 1987) puts vertices where the
+share of light that is taken away passes the level, linearly between voxels. Dense places are thin
+sheets with a front and a back, so that only what at least two views see from its front is kept,
+which has the mean of their colours. All happens in a frame whose origin is the middle of the
+bounds, which keeps float32 exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import open3d
+from numpy.typing import NDArray
+
+from pipelines.exports.mesh import Floats, TriangleMesh, empty_mesh, ordered
+from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
+from pipelines.exports.surface.tsdf import Blocks, Sized, touched_blocks, voxel_grid
+from pipelines.scene.bounds import SceneBounds
+from pipelines.scene.depth_views import DepthView
+from pipelines.scene.picture_sampling import between_pixels
+
+Density = Callable[[Floats], NDArray[np.floating[Any]]]
+"""From points [N, 3], world, to density [N] per world unit."""
+
+LEVEL = 0.5
+_MIN_VIEWS = 2
+"""A surface that one view alone shows is not believed."""
+_BESIDE_VOXELS = 3.0
+"""How far the surface may lie from a view's depth, along its axis, to be what that view sees."""
+_LEAST_COSINE = 0.1
+_TOGETHER = 512
+"""Blocks asked at a time: 262,144 points."""
+_FIND_SHARE, _ASK_SHARE, _EXTRACT_SHARE = 0.1, 0.8, 0.85
+
+# open3d's type stubs refuse its own documented calls, so its modules are used untyped.
+_core: Any = open3d.core
+
+
+def extract(
+    density: Density,
+    views: Sized,
+    bounds: SceneBounds,
+    voxel: float,
+    on_progress: Callable[[float], None] = lambda done: None,
+    blocks: Blocks | None = None,
+    level: float = LEVEL,
+) -> TriangleMesh:
+    """The surface within the bounds that views see.
+
+    views: are iterated twice. voxel: side of a voxel, world units. on_progress: told the share that
+    is done; may raise. blocks: where `tsdf.affordable_blocks` found them for that voxel. level: of
+    the light that goes through a voxel's length, the share that is taken away at the surface.
+    Returns a mesh without vertices where there is none.
+    """
+    origin = (bounds.box_min + bounds.box_max) / 2.0
+    if blocks is None:
+        blocks = touched_blocks(views, bounds, voxel, lambda done: on_progress(_FIND_SHARE * done))
+    if len(blocks) == 0:
+        return empty_mesh()
+
+    def on_asked(done: float) -> None:
+        on_progress(_FIND_SHARE + (_ASK_SHARE - _FIND_SHARE) * done)
+
+    grid = _filled(density, blocks, voxel, origin, level, on_asked)
+    nowhere = np.zeros(3)
+    made = from_open3d(grid.extract_triangle_mesh(0.5).to_legacy(), nowhere)
+    del grid
+    on_progress(_EXTRACT_SHARE)
+    if len(made.faces) == 0:
+        return empty_mesh()
+    # Its threads number vertices and faces as they come to them, another way in each run.
+    made = from_open3d(to_open3d(ordered(made), nowhere), origin)
+    return _seen(
+        made,
+        views,
+        _BESIDE_VOXELS * voxel,
+        lambda done: on_progress(_EXTRACT_SHARE + (1.0 - _EXTRACT_SHARE) * done),
+    )
+
+
+def _filled(
+    density: Density,
+    blocks: Blocks,
+    voxel: float,
+    origin: Floats,
+    level: float,
+    on_progress: Callable[[float], None],
+) -> Any:
+    """Open3D's grid with the level less the share of light that each voxel takes away."""
+    grid = voxel_grid(voxel, len(blocks))
+    found, _ = grid.hashmap().activate(_core.Tensor(blocks))
+    values, weights = (grid.attribute(name).reshape((-1, 1)) for name in ("tsdf", "weight"))
+    for begin in range(0, len(blocks), _TOGETHER):
+        on_progress(begin / len(blocks))
+        places, flat = grid.voxel_coordinates_and_flattened_indices(
+            found[begin : begin + _TOGETHER]
+        )
+        thick = np.asarray(density(places.numpy().astype(np.float64) + origin), np.float64) * voxel
+        signed = (level + np.expm1(-thick)).astype(np.float32)[:, None]
+        values[flat] = _core.Tensor(signed)
+        weights[flat] = _core.Tensor(np.ones_like(signed))
+    on_progress(1.0)
+    return grid
+
+
+def _seen(
+    mesh: TriangleMesh, views: Sized, beside: float, on_progress: Callable[[float], None]
+) -> TriangleMesh:
+    """The faces whose corners two views see from their front, in the mean of their colours.
+
+    beside: how far from a view's depth a vertex may be, world units.
+    """
+    count = np.zeros(len(mesh.vertices), np.int32)
+    total = np.zeros((len(mesh.vertices), 3))
+    for done, view in enumerate(views, start=1):
+        which, colors = _shown(mesh, view, beside)
+        count[which] += 1
+        total[which] += colors
+        on_progress(done / len(views))
+    seen = count >= _MIN_VIEWS
+    faces = mesh.faces[seen[mesh.faces].all(axis=1)]
+    if len(faces) == 0:
+        return empty_mesh()
+    mean: Floats = np.clip(total / np.maximum(count, 1)[:, None], 0.0, 1.0)
+    return replace(mesh, colors=mean).with_faces(faces)
+
+
+def _shown(
+    mesh: TriangleMesh, view: DepthView, beside: float
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Which vertices a view sees from their front, [Q], and their colours there, [Q, 3]."""
+    lens, eye = view.lens, view.world_from_camera[:, 3]
+    toward = mesh.vertices - eye
+    x, y, back = (toward @ view.world_from_camera[:, :3]).T
+    depth = np.maximum(-back, 1e-12)
+    facing = -(toward * mesh.normals).sum(axis=1) > _LEAST_COSINE * np.linalg.norm(toward, axis=1)
+    column, row = lens.cx + lens.fl_x * x / depth, lens.cy - lens.fl_y * y / depth
+    inside = facing & (back < -1e-9) & (column >= 0) & (column < lens.width)
+    which = np.flatnonzero(inside & (row >= 0) & (row < lens.height))
+    found = view.z_depth[row[which].astype(int), column[which].astype(int)]
+    which = which[(found > 0) & (np.abs(found - depth[which]) <= beside)]
+    picture = np.asarray(view.rgb, np.float32) / np.float32(255.0)
+    return which, between_pixels(picture, column[which], row[which])
