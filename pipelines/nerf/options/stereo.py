@@ -57,5 +57,6 @@ class StereoConfig:
     standing_walls: bool = option(
         True,
         "Lay patches of even brightness on upright planes where they meet a floor along a line "
-        "that several views see in the same place, and other views agree.",
+        "that several views see in the same place, and other views agree; and where neighbours see "
+        "such a wall.",
     )

@@ -81,7 +81,7 @@ def confirmed(
     refutes: Callable[[NDArray[np.int32], NDArray[np.int32]], NDArray[np.bool_]],
     on_progress: Callable[[float], None],
 ) -> list[DepthMap]:
-    """The filled maps, without what the neighbours' refute of the depths that the maps have not.
+    """The filled maps, as the maps were where neighbours refute a depth that is new.
 
     refutes: of the numbers of neighbours, [H, W] each, that agree and that see through.
     on_progress: told the share that is done; may raise.
@@ -89,11 +89,12 @@ def confirmed(
     kept = []
     for index, found in enumerate(maps):
         votes, _ = votes_of_others(index, views, filled, neighbours[index], config)
-        guessed = (found.z == 0) & (filled[index] > 0)
+        moved = np.abs(filled[index] - found.z) > 2.0 * ON_PLANE * found.z
+        guessed = (filled[index] > 0) & moved
         refuted = guessed & refutes(votes[AGREE], votes[SEE_THROUGH])
         kept.append(
             DepthMap(
-                np.where(refuted, np.float32(0.0), filled[index]),
+                np.where(refuted, found.z, filled[index]),
                 np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
             )
         )
@@ -178,6 +179,20 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats) -> Depths:
     taken = decided[patches] & (fills | moves)
     laid: Depths = np.where(taken, 1.0 / np.where(taken, found, 1.0), z).astype(np.float32)
     return laid
+
+
+def inverse_depths(view: StereoView, planes: Floats, x: Floats, y: Floats) -> Floats:
+    """[P, ...], 1 / z of each plane along rays to (x, y, 1); not positive where a ray misses it."""
+    apart = planes[:, 3] - planes[:, :3] @ view.center
+    apart = np.where(np.abs(apart) < 1e-9, 1e-9, apart)
+    turned = planes[:, :3] @ view.world_from_camera[:, :3] / apart[:, None]
+    return np.stack([x * a + (y * b + c) for a, b, c in turned])
+
+
+def ray_grid(view: StereoView) -> tuple[Floats, Floats]:
+    """x [W] and y [H, 1] of the pixels' rays."""
+    x, y = view.rays()
+    return x.astype(np.float64), y.astype(np.float64)[:, None]
 
 
 def _rays(view: StereoView) -> Floats:

@@ -27,15 +27,30 @@ from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.maps import DepthMap, Progress, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.patches import Labels, even_patches
-from pipelines.nerf.stereo.planes import ON_PLANE, Floats, confirmed, find_planes, known_samples
+from pipelines.nerf.stereo.planes import (
+    ON_PLANE,
+    Floats,
+    confirmed,
+    find_planes,
+    inverse_depths,
+    known_samples,
+    ray_grid,
+)
+from pipelines.nerf.stereo.spreading import (
+    MOST_KNOWN,
+    PlainPatches,
+    refutes,
+    replaceable,
+    spread,
+)
 from pipelines.nerf.stereo.views import StereoView
 
 Depths = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
-_LEAST_AREA, _MOST_KNOWN = 0.004, 0.5
-"""A patch is open if it is so large, of the picture, and no more of it is known."""
+_LEAST_AREA = 0.004
+"""A patch is open if it is so large, of the picture, and no more than half of it is known."""
 _LEAST_INSIDE = 0.5
 """What is thinner is an edge that is not sharp, neither here nor there."""
 _REACH_PX = 5
@@ -53,8 +68,7 @@ _SAME_DEG = 4.0
 _TOUCH_PX, _TOUCH_SHARE, _MOST_TOUCHED = 12, 0.12, 3
 _BENEATH_WEIGHT = 0.5
 _EXTRAPOLATED = 3.0
-_PER_REFUSAL = 2
-_PLANES_SHARE, _LOOK_SHARE, _LAY_SHARE = 0.1, 0.4, 0.7
+_PLANES_SHARE, _LOOK_SHARE, _LAY_SHARE, _SPREAD_SHARE = 0.1, 0.35, 0.5, 0.75
 _MESSAGE = "standing walls up"
 
 
@@ -93,8 +107,8 @@ def stood_up(
 ) -> list[DepthMap]:
     """The maps with plain patches on the walls that their borders with the floor tell of.
 
-    Only unknown pixels change: they get their wall's depth where a neighbour agrees and none sees
-    through it, or twice as many agree.
+    Pixels of plain patches change that are unknown, or seem to be nearer than the wall: they get
+    its depth where a neighbour agrees and none sees through it, or twice as many agree.
     """
     planes = find_planes(views, maps, lambda done: on_progress(_PLANES_SHARE * done, _MESSAGE))
     points, depths = known_samples(views, maps)
@@ -106,15 +120,10 @@ def stood_up(
         looks.append(_look(view, found.z, planes))
         share = (_LOOK_SHARE - _PLANES_SHARE) * (index + 1) / len(views)
         on_progress(_PLANES_SHARE + share, _MESSAGE)
-    walls = [
-        wall
-        for wall in _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
-        if not _is_known(wall.plane, planes, float(np.median(depths)))
-    ]
+    walls = _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
     if not walls:
         return list(maps)
-    every = np.vstack([planes, [wall.plane for wall in walls]])
-    stands_on = [-1] * len(planes) + [wall.floor for wall in walls]
+    every, stands_on = _with_walls(planes, walls, float(np.median(depths)))
     filled = []
     for index, (look, found) in enumerate(zip(looks, maps, strict=True)):
         filled.append(_laid(look, found.z, every, stands_on))
@@ -122,14 +131,23 @@ def stood_up(
         on_progress(_LOOK_SHARE + share, _MESSAGE)
     seen = surface_points(views, [found.z for found in maps])
     neighbours = choose_neighbours(views, seen, config.num_neighbours, config.best_angle_deg)
-    return confirmed(
+    laid = confirmed(
         views,
         maps,
         filled,
         neighbours,
         config,
-        lambda agree, through: agree < np.maximum(1, _PER_REFUSAL * through),
-        lambda done: on_progress(_LAY_SHARE + (1.0 - _LAY_SHARE) * done, _MESSAGE),
+        refutes,
+        lambda done: on_progress(_LAY_SHARE + (_SPREAD_SHARE - _LAY_SHARE) * done, _MESSAGE),
+    )
+    return spread(
+        [PlainPatches(look.view, look.patches, look.open_patches) for look in looks],
+        maps,
+        laid,
+        every[np.array(stands_on) >= 0],
+        neighbours,
+        config,
+        lambda done: on_progress(_SPREAD_SHARE + (1.0 - _SPREAD_SHARE) * done, _MESSAGE),
     )
 
 
@@ -151,20 +169,6 @@ def _floors(
     return found
 
 
-def _inverse_depths(view: StereoView, planes: Floats, x: Floats, y: Floats) -> Floats:
-    """[P, ...], 1 / z of each plane along rays to (x, y, 1); not positive where a ray misses it."""
-    apart = planes[:, 3] - planes[:, :3] @ view.center
-    apart = np.where(np.abs(apart) < 1e-9, 1e-9, apart)
-    turned = planes[:, :3] @ view.world_from_camera[:, :3] / apart[:, None]
-    return np.stack([x * a + (y * b + c) for a, b, c in turned])
-
-
-def _pixels(view: StereoView) -> tuple[Floats, Floats]:
-    """x [W] and y [H, 1] of the pixels' rays."""
-    x, y = view.rays()
-    return x.astype(np.float64), y.astype(np.float64)[:, None]
-
-
 def _look(view: StereoView, z: Depths, planes: Floats) -> _Look:
     patches = even_patches(view.picture)
     known, usable = z > 0, view.picture >= 0.0
@@ -173,22 +177,22 @@ def _look(view: StereoView, z: Depths, planes: Floats) -> _Look:
     num_known = np.bincount(patches[known], minlength=num)
     edges = _edges(patches)
     inside = np.bincount(patches[~edges], minlength=num)
-    is_open = (area >= _LEAST_AREA * patches.size) & (num_known < _MOST_KNOWN * area)
+    is_open = (area >= _LEAST_AREA * patches.size) & (num_known < MOST_KNOWN * area)
     is_open &= inside >= _LEAST_INSIDE * area
     places = np.arange(patches.size).reshape(patches.shape)
     expand: Any = expand_labels
     nearest = expand(np.where(known & ~is_open[patches], places + 1, 0), _REACH_PX)
     border = edges & is_open[patches] & (nearest > 0) & usable
     here, there = np.nonzero(border), np.unravel_index(nearest[border] - 1, patches.shape)
-    columns, rows = (axis.ravel() for axis in _pixels(view))
+    columns, rows = (axis.ravel() for axis in ray_grid(view))
     depth = z[there].astype(np.float64)
-    off = np.abs(_inverse_depths(view, planes, columns[there[1]], rows[there[0]]) * depth - 1.0)
+    off = np.abs(inverse_depths(view, planes, columns[there[1]], rows[there[0]]) * depth - 1.0)
     plane = off.argmin(axis=0)
     plane = np.where(off[plane, np.arange(len(plane))] < ON_PLANE, plane, -1)
     # An edge is some pixels wide: it is half way between what is plain and what is known.
     x = 0.5 * (columns[here[1]] + columns[there[1]])
     y = 0.5 * (rows[here[0]] + rows[there[0]])
-    inverse = _inverse_depths(view, planes, x, y)[plane, np.arange(len(plane))]
+    inverse = inverse_depths(view, planes, x, y)[plane, np.arange(len(plane))]
     depth = np.where((plane >= 0) & (inverse > 1e-9), 1.0 / np.maximum(inverse, 1e-9), depth)
     patch = patches[border].astype(np.int64)
     return _Look(view, patches, np.flatnonzero(is_open), x, y, patch, depth, plane)
@@ -322,12 +326,23 @@ def _share_behind(centers: Floats, plane: Floats) -> float:
     return min(before, 1.0 - before)
 
 
-def _is_known(wall: Floats, planes: Floats, depth: float) -> bool:
-    """Whether one of the planes is the same, at points as far away as that."""
-    turn = planes[:, :3] @ wall[:3]
-    aligned = np.abs(turn) > np.cos(np.radians(_SAME_DEG))
-    close = np.abs(planes[:, 3] * np.sign(turn) - wall[3]) < ON_PLANE * depth
-    return bool((aligned & close).any())
+def _with_walls(planes: Floats, walls: Sequence[_Wall], depth: float) -> tuple[Floats, list[int]]:
+    """The planes and the walls that are none of them; and of each on which floor it stands, or -1.
+
+    depth: how far away planes and walls may differ by a hundredth to be the same.
+    """
+    every, stands_on = list(planes), [-1] * len(planes)
+    for wall in walls:
+        turn = planes[:, :3] @ wall.plane[:3]
+        aligned = np.abs(turn) > np.cos(np.radians(_SAME_DEG))
+        close = np.abs(planes[:, 3] * np.sign(turn) - wall.plane[3]) < ON_PLANE * depth
+        same = np.flatnonzero(aligned & close)
+        if len(same):
+            stands_on[same[0]] = wall.floor
+        else:
+            every.append(wall.plane)
+            stands_on.append(wall.floor)
+    return np.array(every), stands_on
 
 
 def _laid(look: _Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> Depths:
@@ -340,11 +355,11 @@ def _laid(look: _Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> D
     of a room, or the farther, as outside of a box, whichever more of the border agrees with.
     """
     laid = z.copy()
-    pixels = _pixels(look.view)
+    pixels = ray_grid(look.view)
     for patch in np.intersect1d(look.open_patches, look.patch):
         at = look.patch == patch
         depth, own = look.z[at], look.plane[at]
-        relative = _inverse_depths(look.view, planes, look.x[at], look.y[at]) * depth
+        relative = inverse_depths(look.view, planes, look.x[at], look.y[at]) * depth
         touches = np.abs(relative - 1.0) < 2.0 * ON_PLANE
         touches[own[own >= 0], np.flatnonzero(own >= 0)] = False
         beneath = (relative < 1.0 - 2.0 * ON_PLANE) & (own == np.array(stands_on)[:, None])
@@ -352,16 +367,17 @@ def _laid(look: _Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> D
         chosen = _touched(touches, relative, beneath)
         if not chosen:
             continue
-        inverse = _inverse_depths(look.view, planes[chosen], *pixels)
+        inverse = inverse_depths(look.view, planes[chosen], *pixels)
         found = inverse.max(axis=0)
         if _agreeing(_farther(relative[chosen])) > _agreeing(relative[chosen].max(axis=0)):
             found = _farther(inverse)
-        fits = (look.patches == patch) & (laid == 0) & (look.view.picture >= 0.0)
+        fits = (look.patches == patch) & (look.view.picture >= 0.0)
+        fits &= replaceable(z, found)
         fits &= (found > (1.0 / depth).min() / _EXTRAPOLATED) & (
             found < _EXTRAPOLATED * (1.0 / depth).max()
         )
         for floor in {stands_on[plane] for plane in chosen} - {-1}:
-            ground = _inverse_depths(look.view, planes[[floor]], *pixels)[0]
+            ground = inverse_depths(look.view, planes[[floor]], *pixels)[0]
             fits &= (ground <= 1e-9) | (found >= (1.0 - 2.0 * ON_PLANE) * ground)
         laid[fits] = (1.0 / found[fits]).astype(np.float32)
     return laid

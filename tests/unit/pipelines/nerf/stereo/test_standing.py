@@ -104,3 +104,56 @@ def test_views_without_any_depth_stay_as_they_are() -> None:
     ]
     for after in stood(seen, nothing):
         assert not after.z.any()
+
+
+def with_known(one: Seen, where: tuple[slice, slice], factor: float = 1.0) -> DepthMap:
+    """What is known of a view, and there its true depth times a factor."""
+    z, votes = one.known().z.copy(), one.known().votes.copy()
+    z[where], votes[where] = factor * one.depth[where], 3
+    return DepthMap(z, votes)
+
+
+def test_a_wall_of_which_something_is_known_stands_up_as_well() -> None:
+    """A picture on it tells where it is, not how far it reaches."""
+    seen = [look(place) for place in walk()]
+    picture = (slice(5, 45), slice(90, 150))
+    maps = [with_known(one, picture) for one in seen]
+    for one, before, after in zip(seen, maps, stood(seen, maps), strict=True):
+        wall = ~one.on_floor
+        assert (before.z[wall] > 0).mean() < 0.4
+        assert (after.z[wall] > 0).mean() > 0.8
+        assert (
+            np.abs(after.z[wall & (after.z > 0)] / one.depth[wall & (after.z > 0)] - 1).max() < 0.02
+        )
+
+
+def test_views_in_which_the_foot_of_the_wall_is_hidden_learn_it_from_others() -> None:
+    seen = [look(place) for place in walk()]
+    maps = []
+    for number, one in enumerate(seen):
+        z = one.known().z.copy()
+        foot = int(one.on_floor.any(axis=1).argmax())
+        if number >= 4:
+            z[: foot + 30] = 0.0
+        maps.append(DepthMap(z, np.where(z > 0, 4, 0).astype(np.uint8)))
+    for one, after in zip(seen[4:], stood(seen, maps)[4:], strict=True):
+        wall = ~one.on_floor
+        assert (after.z[wall] > 0).mean() > 0.6
+        there = wall & (after.z > 0)
+        assert np.abs(after.z[there] / one.depth[there] - 1.0).max() < 0.02
+        assert (after.votes[there] >= 1).all()
+
+
+def test_what_seems_to_stand_before_a_plain_wall_goes_back_onto_it() -> None:
+    """Matching by squares makes things a little larger than they are, at the cost of the wall."""
+    seen = [look(place) for place in walk()]
+    halo = (slice(10, 30), slice(100, 130))
+    maps = [with_known(one, halo, 0.8) if i == 3 else one.known() for i, one in enumerate(seen)]
+    after = stood(seen, maps)[3]
+    wall = ~seen[3].on_floor[halo]
+    assert wall.all()
+    right = np.abs(after.z[halo] / seen[3].depth[halo] - 1.0) < 0.02
+    assert right.mean() > 0.9
+    # Something farther is a way through, and stays.
+    maps[3] = with_known(seen[3], halo, 1.3)
+    assert np.array_equal(stood(seen, maps)[3].z[halo], maps[3].z[halo])
