@@ -100,7 +100,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="draft",
-        version=4,
+        version=5,
         after=("depth",),
         reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.draft:run",
