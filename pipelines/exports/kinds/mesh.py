@@ -41,7 +41,7 @@ _FILES: dict[Format, str] = {
 _TEXTURED = frozenset({"glb", "obj", "usdz"})
 """Formats that carry a texture."""
 _RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
-_REFINE_SHARE, _REDUCE_SHARE, _TEXTURE_SHARE = 0.83, 0.86, 0.96
+_MEND_SHARE, _REFINE_SHARE, _REDUCE_SHARE, _TEXTURE_SHARE = 0.82, 0.83, 0.86, 0.96
 _SUBJECT_SHARE = 0.98
 _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 """Photos that refine the mesh are so long, or shorter where all of them would have more pixels."""
@@ -116,6 +116,14 @@ class MeshOptions(CropOptions, TextureOptions):
         description="Floors, walls and table tops become plane where they are so but for bumps of "
         "a voxel or two, and as far as the photos do not say otherwise. Part of refine=photos.",
     )
+    close_holes: float = Field(
+        0.1,
+        ge=0.0,
+        le=10.0,
+        description="Holes with a diameter of so many camera distances, or less, are closed, "
+        "beyond max_distance of more as voxels are larger; not those that cameras look through, "
+        "nor the border of what was filmed. 0 for none.",
+    )
     max_faces: int = Field(
         200_000,
         ge=100,
@@ -174,6 +182,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.subject import find_subject
     from pipelines.exports.subject_files import as_dict, gaze_of, save_subject
     from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
+    from pipelines.exports.surface.holes import close_holes, hole_limits
     from pipelines.exports.surface.refinement import refined
     from pipelines.exports.surface.shells import Subject, affordable, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
@@ -229,23 +238,27 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
             ctx.logger.warning("No Poisson surface, depth is fused in voxels instead: %s", error)
             method = "tsdf"
             mesh = fuse_shells(store, shells, options.max_faces, told, method)
-    if len(mesh.faces) == 0:
-        raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
-    shown = scene.training_images()
-    if options.refine == "photos":
-        side = _photo_side([scene.lens_of(image) for image in shown])
-        photos = [
-            stereo_view(ctx.workspace.images_root, image, scene.lens_of(image), side)
-            for image in shown
-        ]
-        mesh = refined(
-            mesh,
-            photos,
-            _part_of(ctx, "refining", _FUSE_SHARE, _REFINE_SHARE),
-            flat=options.flatten,
-            noise=max((shell.voxel for shell in shells if not shell.is_far), default=0.0),
-        )
-        del photos
+        if len(mesh.faces) == 0:
+            raise _empty(f"{len(images)} views show no surface within the bounds that two agree on")
+        shown = scene.training_images()
+        if options.refine == "photos":
+            side = _photo_side([scene.lens_of(image) for image in shown])
+            photos = [
+                stereo_view(ctx.workspace.images_root, image, scene.lens_of(image), side)
+                for image in shown
+            ]
+            mesh = refined(
+                mesh,
+                photos,
+                _part_of(ctx, "refining", _FUSE_SHARE, _MEND_SHARE),
+                flat=options.flatten,
+                noise=max((shell.voxel for shell in shells if not shell.is_far), default=0.0),
+            )
+            del photos
+        told = _part_of(ctx, "closing holes", _MEND_SHARE, _REFINE_SHARE)
+        limits = hole_limits(shells, options.close_holes, options.max_distance)
+        closing = close_holes(mesh, limits, store, told)
+        mesh = closing.mesh
     gaze = gaze_of(shown, [scene.lens_of(image) for image in shown])
     decision = None
     if crop is None and options.extent != "scene":
@@ -314,6 +327,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         "num_views": len(images),
         "voxel": round(shells[0].voxel, 9),
         "coarser": coarser,
+        "holes": closing.as_dict(),
         "subject": subject,
         "crop": told_crop,
         "bounds": shells[0].bounds.as_dict(),

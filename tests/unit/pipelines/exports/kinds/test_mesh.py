@@ -16,6 +16,7 @@ from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.surface import poisson_solver, tsdf
+from pipelines.exports.surface.borders import border_loops
 from pipelines.exports.texture import charts
 from pipelines.judging.asset_views import Texture
 from pipelines.manifest import RunHooks
@@ -316,3 +317,18 @@ def test_a_mesh_for_which_memory_has_no_room_is_coarser_and_says_so(
     assert coarse["voxel"] > 1.2 * fine["voxel"]
     assert "mesh.resolution" in coarse["coarser"]["reason"]
     assert coarse["num_faces"] < fine["num_faces"]
+
+
+def test_holes_up_to_a_stated_size_are_closed_and_the_report_says_how_many(job: Workspace) -> None:
+    plain = {"texture": "none", "extent": "scene"}
+    torn = tiny_job.run(job, "mesh", close_holes=0.0, **plain)["summary"]
+    before = read_ply(job.stage("mesh") / "mesh.ply")
+    assert torn["holes"] == {"closed": 0, "left_open": {}}
+    closed = tiny_job.run(job, "mesh", close_holes=0.5, **plain)["summary"]
+    after = read_ply(job.stage("mesh") / "mesh.ply")
+    assert closed["holes"]["closed"] > 0
+    assert set(closed["holes"]["left_open"]) <= {"outer", "seen_through", "occupied", "tangled"}
+    assert len(border_loops(after.faces)) < len(border_loops(before.faces))
+    count = len(before.faces)
+    assert len(after.faces) > count
+    np.testing.assert_array_equal(after.faces[:count], before.faces)
