@@ -29,7 +29,7 @@ from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.reduction import reduced
 from pipelines.exports.texture.bake import texture_from_photos
-from pipelines.exports.texture.field import pixels_on, texture_from_field
+from pipelines.exports.texture.field import pixels_on, seen_from, texture_from_field
 from pipelines.exports.texture.photos import Photos
 from pipelines.judging.asset_scores import mean_scores, score_view
 from pipelines.judging.asset_views import MeshCaster, Texture
@@ -107,7 +107,8 @@ def kinds_of(
 
     def from_field(shape: TriangleMesh) -> TexturedMesh:
         pixel = pixels_on(shape, shown, lenses, scene.trained_long_side_px)
-        return texture_from_field(shape, scene.short_rays, pixel, texture_px)
+        toward = seen_from(shape, photos)
+        return texture_from_field(shape, scene.short_rays, pixel, toward, texture_px)
 
     yield "full, vertex colours", mesh
     yield "full, photos", texture_from_photos(mesh, photos, texture_px)

@@ -17,7 +17,7 @@ from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import TextureOptions
 from pipelines.exports.texture.charts import CELL_PX, Charts, Layout, TextureFull, cut, lay_out
 from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos
-from pipelines.exports.texture.field import pixels_on, texture_from_field
+from pipelines.exports.texture.field import pixels_on, seen_from, texture_from_field
 from pipelines.exports.texture.levelling import levels
 from pipelines.exports.texture.photos import Photos, colors_at, softened
 from pipelines.exports.texture.texels import spread, texels_of
@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _CHOICE_SHARE, _CUT_SHARE, _COPY_SHARE = 0.55, 0.65, 0.85
+_LOOK_SHARE = 0.1
 _SPREAD_PX = 3
 
 
@@ -54,15 +55,21 @@ def painted(
     def on_progress(done: float) -> None:
         ctx.progress(begin + (end - begin) * done, "painting", None)
 
+    photos = Photos(ctx.workspace.images_root, images, lenses)
     try:
         if options.texture == "field":
             if scene is None:
                 raise ValueError("before training there is no field to paint with")
             pixel = pixels_on(mesh, images, lenses, scene.trained_long_side_px)
+            toward = seen_from(mesh, photos, lambda done: on_progress(_LOOK_SHARE * done))
             return texture_from_field(
-                mesh, scene.short_rays, pixel, options.texture_px, on_progress
+                mesh,
+                scene.short_rays,
+                pixel,
+                toward,
+                options.texture_px,
+                lambda done: on_progress(_LOOK_SHARE + (1.0 - _LOOK_SHARE) * done),
             )
-        photos = Photos(ctx.workspace.images_root, images, lenses)
         return texture_from_photos(mesh, photos, options.texture_px, on_progress)
     except TextureFull as error:
         ctx.logger.warning(

@@ -1,13 +1,15 @@
 """A mesh with a picture on it, out of the trained field.
 
 The mesh is unwrapped, each texel is turned into a place on the surface by its barycentric
-coordinates, and a short ray through that place, against the normal, is rendered with the field's
-mean appearance. Source: Nerfstudio, arXiv:2302.04264, section 4.3.
+coordinates, and a short ray through that place is rendered with the field's mean appearance.
+Source: Nerfstudio, arXiv:2302.04264, section 4.3.
 
-Departures: a ray begins no farther out than half the way to what else of the mesh stands before it,
-so that it does not begin in another surface; and where a ray meets hardly anything (the mesh closes
-a hole, or lies beside what the field learned), the mesh's own colours take its place. Memory: a few
-rows of the picture at a time, and the picture itself.
+Departures: rays go the way that cameras looked, and against the normal where none did, as a field
+knows its colours only as they were seen (a floor, by who walked over it, never from above); a ray
+begins no farther out than half the way to what else of the mesh stands before it, so that it does
+not begin in another surface; and where a ray meets hardly anything (the mesh closes a hole, or lies
+beside what the field learned), the mesh's own colours take its place. Memory: a few rows of the
+picture at a time, and the picture itself.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ import open3d
 from numpy.typing import NDArray
 
 from pipelines.exports.mesh import Floats, TexturedMesh, TriangleMesh, unit_normals
+from pipelines.exports.surface.sight import Sight
+from pipelines.exports.texture.photos import Photos
 from pipelines.exports.texture.texels import Texels, spread, texels_of
 from pipelines.exports.texture.unwrap import GUTTER_PX, unwrap
 from pipelines.nerf.renderer import RenderedImage
@@ -34,6 +38,7 @@ _LEAST_REACH, _MOST_REACH = 2.0, 8.0
 """Half a ray's length, in such pixels; between them it is the mean edge of the mesh there."""
 _OPAQUE = 0.5
 """A ray that meets less of the field fades into the mesh's own colours."""
+_LEAST_COSINE = 0.1
 _UNWRAP_SHARE, _RENDER_SHARE = 0.15, 0.97
 _ROWS = 64
 
@@ -46,14 +51,15 @@ def texture_from_field(
     mesh: TriangleMesh,
     look: Look,
     pixel: Floats,
+    toward: Floats,
     largest_side: int,
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> TexturedMesh:
     """Paint a mesh of the world with what short rays through its surface show.
 
-    pixel: [F], what a pixel that was trained on covers on each face, world units. largest_side: of
-    the texture, px, a power of two. on_progress: told the share that is done; may raise. Raises
-    TextureFull.
+    pixel: [F], what a pixel that was trained on covers on each face, world units. toward: [V, 3],
+    unit, from where each vertex is looked at. largest_side: of the texture, px, a power of two.
+    on_progress: told the share that is done; may raise. Raises TextureFull.
     """
     origin = mesh.vertices.mean(axis=0)
     local = mesh.vertices - origin
@@ -67,7 +73,7 @@ def texture_from_field(
     ground = np.rint(255.0 * np.clip(mesh.colors.mean(axis=0), 0.0, 1.0)).astype(np.uint8)
     picture = np.broadcast_to(ground, (atlas.side, atlas.side, 3)).copy()
     covered = np.zeros(picture.shape[:2], np.bool_)
-    surface = _Surface(local, mesh, _reaches(local, mesh.faces, pixel, atlas.face_chart))
+    surface = _Surface(local, mesh, toward, _reaches(local, mesh.faces, pixel, atlas.face_chart))
     last = max(1.0, min(float(atlas.uv[:, 1].max()) + 1.0, atlas.side))
     for texels in texels_of(atlas.uv, atlas.faces, atlas.side, _ROWS):
 
@@ -106,10 +112,11 @@ def _reaches(vertices: Floats, faces: NDArray[np.int32], pixel: Floats, chart: A
 
 
 class _Surface:
-    """A mesh, its vertices less an origin, and how far rays reach beside each face [F]."""
+    """A mesh, its vertices less an origin, from where each is looked at [V, 3], and how far rays
+    reach beside each face [F]."""
 
-    def __init__(self, vertices: Floats, mesh: TriangleMesh, reach: Floats) -> None:
-        self.vertices, self.mesh, self.reach = vertices, mesh, reach
+    def __init__(self, vertices: Floats, mesh: TriangleMesh, toward: Floats, reach: Floats) -> None:
+        self.vertices, self.mesh, self.toward, self.reach = vertices, mesh, toward, reach
         self._scene = _tensor_geometry.RaycastingScene()
         self._scene.add_triangles(
             _core.Tensor(vertices.astype(np.float32)),
@@ -123,7 +130,7 @@ class _Surface:
         corners = self.mesh.faces[texels.face]
         weights = texels.weights[..., None]
         points: Floats = (weights * self.vertices[corners]).sum(axis=1)
-        out = self._outward(texels.face, (weights * self.mesh.normals[corners]).sum(axis=1))
+        out = self._outward(texels.face, (weights * self.toward[corners]).sum(axis=1))
         own: Floats = (weights * self.mesh.colors[corners]).sum(axis=1)
         reach = self.reach[texels.face]
         start = self._free(points, out, reach)
@@ -143,11 +150,12 @@ class _Surface:
         return colors
 
     def _outward(self, face: NDArray[np.int64], smooth: Floats) -> Floats:
-        """Unit normals [N, 3]: those of vertices, unless they look to the back of their face."""
+        """From where to look, [N, 3]: as vertices are, or along the normal of a face whose back or
+        edge that would show."""
         a, b, c = (self.vertices[self.mesh.faces[face, corner]] for corner in range(3))
         flat = unit_normals(np.cross(b - a, c - a))
         smooth = unit_normals(smooth)
-        behind = (smooth * flat).sum(axis=1) <= 0.1
+        behind = (smooth * flat).sum(axis=1) <= _LEAST_COSINE
         out: Floats = np.where(behind[:, None], flat, smooth)
         return out
 
@@ -158,6 +166,35 @@ class _Surface:
         free = self._scene.cast_rays(_core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
         begins: Floats = np.minimum(reach, 0.5 * (free + 0.05 * reach))
         return begins
+
+
+def seen_from(
+    mesh: TriangleMesh, photos: Photos, on_progress: Callable[[float], None] = lambda done: None
+) -> Floats:
+    """From where each vertex was looked at, [V, 3], unit: the mean of the ways to the photos that
+    show it, nothing in the way, the larger the more; its normal where none does.
+
+    on_progress: told the share that is done; may raise.
+    """
+    vertices = photos.frame.scene_from_world(mesh.vertices)
+    sight = Sight(vertices, mesh.faces)
+    corners = vertices[mesh.faces]
+    edge = float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
+    lifted = vertices + 0.5 * edge * mesh.normals
+    total = np.zeros_like(vertices)
+    for index in range(len(photos)):
+        eye = photos.eye(index)
+        ways = eye - vertices
+        distance = np.maximum(np.linalg.norm(ways, axis=1), 1e-30)
+        ways /= distance[:, None]
+        facing = (ways * mesh.normals).sum(axis=1)
+        _, shown = photos.pixels(index, vertices)
+        which = np.flatnonzero(shown & (facing > _LEAST_COSINE))
+        which = which[sight.reached(eye, lifted[which])]
+        total[which] += (facing[which] / distance[which] ** 2)[:, None] * ways[which]
+        on_progress((index + 1) / len(photos))
+    known = (total != 0.0).any(axis=1)
+    return unit_normals(np.where(known[:, None], total, mesh.normals))
 
 
 def pixels_on(

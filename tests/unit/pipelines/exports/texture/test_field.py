@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.ndimage import binary_dilation
 from pipelines.errors import Cancelled
 from pipelines.exports.mesh import Floats, TexturedMesh, TriangleMesh, joined
 from pipelines.exports.texture.charts import TextureFull
-from pipelines.exports.texture.field import pixels_on, texture_from_field
+from pipelines.exports.texture.field import pixels_on, seen_from, texture_from_field
 from pipelines.exports.texture.texels import texels_of
 from pipelines.exports.texture.told import skin_told
 from pipelines.exports.texture.unwrap import GUTTER_PX
@@ -27,7 +28,7 @@ from tests.unit.pipelines.exports.texture.glowing_ball import (
     on_ball,
     scene_of,
 )
-from tests.unit.pipelines.exports.texture.painted_ball import CENTER, LENS, stripes
+from tests.unit.pipelines.exports.texture.painted_ball import CENTER, LENS, photos_of, stripes
 from tests.unit.pipelines.exports.texture.test_bake import surface_samples
 
 PIXEL = 0.012
@@ -36,7 +37,8 @@ PIXEL = 0.012
 def painted(
     mesh: TriangleMesh, scene: TrainedScene, side: int = 1024, pixel: float = PIXEL
 ) -> TexturedMesh:
-    return texture_from_field(mesh, scene.short_rays, np.full(len(mesh.faces), pixel), side)
+    pixels = np.full(len(mesh.faces), pixel)
+    return texture_from_field(mesh, scene.short_rays, pixels, mesh.normals, side)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,7 @@ def test_the_colours_of_the_field_are_there_and_in_place(ball: TexturedMesh) -> 
 def test_no_texel_of_a_face_or_beside_one_is_bare() -> None:
     mesh = painted_ball.ball()
     blue = replace(mesh, colors=np.tile([0.0, 0.0, 1.0], (len(mesh.colors), 1)))
-    skin = texture_from_field(blue, red, np.full(len(mesh.faces), PIXEL), 1024)
+    skin = texture_from_field(blue, red, np.full(len(mesh.faces), PIXEL), blue.normals, 1024)
     side = len(skin.texture)
     covered = np.zeros((side, side), bool)
     for texels in texels_of(skin.uv * side, skin.faces, side):
@@ -123,6 +125,48 @@ def test_where_the_field_has_nothing_the_mesh_keeps_its_own_colours() -> None:
     assert np.abs(found - 0.5).max() < 0.01, "grey, as the vertices are"
 
 
+def test_rays_go_through_their_texels_from_where_they_were_looked_at() -> None:
+    mesh = painted_ball.ball()
+    up = np.tile([0.0, 0.0, 1.0], (len(mesh.vertices), 1))
+    asked: list[tuple[Floats, Floats]] = []
+
+    def look(begins: Floats, directions: Floats, length: float, on_part: Any) -> RenderedImage:
+        asked.append((begins, directions))
+        seen: RenderedImage = red(begins, directions, length, on_part)
+        return seen
+
+    texture_from_field(mesh, look, np.full(len(mesh.faces), 0.05), up, 1024)
+    begins, ways = (np.concatenate(parts) for parts in zip(*asked, strict=True))
+    down = ways[:, 2] < -0.999
+    height = (begins - CENTER)[:, 2]
+    assert down[height > 0.6].all(), "against what was given, not against the normal"
+    below = ~down & (height < -0.2)
+    assert below.sum() > 100
+    outward = (begins - CENTER)[below] / np.linalg.norm((begins - CENTER)[below], axis=1)[:, None]
+    assert (-(ways[below] * outward).sum(axis=1)).min() > 0.95, "from behind nothing shows"
+
+
+def test_a_vertex_is_looked_at_from_the_cameras_that_see_it(tmp_path: Path) -> None:
+    ball = painted_ball.ball()
+    scene = scene_of(GlowingBall())
+    one = scene.training_images()[1:2]
+    eye = np.asarray(one[0].world_from_camera)[:, 3]
+    toward = seen_from(ball, photos_of(tmp_path, one))
+    way = eye - ball.vertices
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    facing = (way * ball.normals).sum(axis=1)
+    assert np.allclose(toward[facing > 0.2], way[facing > 0.2], atol=1e-4)
+    assert np.allclose(toward[facing < 0.0], ball.normals[facing < 0.0])
+    before = replace(ball, vertices=CENTER + 0.3 * (ball.vertices - CENTER) + 0.5 * (eye - CENTER))
+    hidden = seen_from(joined([ball, before]), photos_of(tmp_path, one))[: len(ball.vertices)]
+    middle = facing > 0.95
+    assert middle.sum() > 3
+    assert np.allclose(hidden[middle], ball.normals[middle]), "what stands before it hides it"
+    all_round = seen_from(ball, photos_of(tmp_path, scene.training_images()))
+    assert np.allclose(np.linalg.norm(all_round, axis=1), 1.0)
+    assert (all_round * ball.normals).sum(axis=1).min() > 0.5
+
+
 def test_a_short_ray_ends_where_it_is_told_to_and_leaves_the_model_as_it_was() -> None:
     model = GlowingBall()
     scene = scene_of(model)
@@ -176,14 +220,14 @@ def test_a_mesh_that_does_not_fit_is_refused() -> None:
     faces = np.arange(4500).reshape(-1, 3).astype(np.int32)
     soup = TriangleMesh(vertices, faces, np.full_like(vertices, 0.5), np.ones_like(vertices))
     with pytest.raises(TextureFull):
-        texture_from_field(soup, red, np.full(1500, PIXEL), 256)
+        texture_from_field(soup, red, np.full(1500, PIXEL), soup.normals, 256)
 
 
 def test_it_tells_how_far_it_is_and_can_be_cancelled_anywhere() -> None:
     told: list[float] = []
     mesh, look = painted_ball.ball(), scene_of(GlowingBall()).short_rays
     pixel = np.full(len(mesh.faces), 4.0 * PIXEL)
-    texture_from_field(mesh, look, pixel, 1024, told.append)
+    texture_from_field(mesh, look, pixel, mesh.normals, 1024, told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
     assert len(set(told)) > 8
@@ -196,5 +240,5 @@ def test_it_tells_how_far_it_is_and_can_be_cancelled_anywhere() -> None:
                 raise Cancelled("stopped")
 
         with pytest.raises(Cancelled):
-            texture_from_field(mesh, look, pixel, 1024, on_progress)
+            texture_from_field(mesh, look, pixel, mesh.normals, 1024, on_progress)
         assert len(heard) == stop_at
