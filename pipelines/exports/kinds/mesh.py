@@ -79,11 +79,11 @@ class MeshOptions(CropOptions, TextureOptions):
         "density itself at density_level, near what the views see.",
     )
     density_level: float = Field(
-        0.5,
+        0.25,
         ge=0.01,
         le=0.99,
         description="Where the surface of method=marching_cubes is: of the light that goes through "
-        "a voxel's length there, this share is taken away. Lower is farther out.",
+        "a voxel's length there, this share is taken away. Higher is more exact, with more holes.",
     )
     resolution: int = Field(
         256,

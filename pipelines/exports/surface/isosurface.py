@@ -1,4 +1,4 @@
-"""The surface of a trained density field: where a voxel's length takes away half of the light.
+"""The surface of a trained density field: where a voxel's length takes away a share of the light.
 
 The field is asked at voxels near what the views see, in blocks, so that memory is bounded and what
 no camera looks at is left out; marching cubes (Lorensen and Cline 1987) puts vertices where the
@@ -28,7 +28,7 @@ from pipelines.scene.picture_sampling import between_pixels
 Density = Callable[[Floats], NDArray[np.floating[Any]]]
 """From points [N, 3], world, to density [N] per world unit."""
 
-LEVEL = 0.5
+LEVEL = 0.25
 _MIN_VIEWS = 2
 """A surface that one view alone shows is not believed."""
 _BESIDE_VOXELS = 3.0

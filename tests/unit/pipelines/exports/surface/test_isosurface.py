@@ -8,7 +8,7 @@ import pytest
 from pipelines.errors import Cancelled
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.surface import isosurface
-from pipelines.exports.surface.isosurface import extract
+from pipelines.exports.surface.isosurface import LEVEL, extract
 from pipelines.exports.surface.shells import Shell, fuse_shells
 from pipelines.exports.surface.tsdf import touched_blocks
 from pipelines.scene.bounds import SceneBounds
@@ -35,10 +35,10 @@ def away(points: np.ndarray) -> np.ndarray:
 def sheet(points: np.ndarray) -> np.ndarray:
     """Dense where a ball's surface is, 3 voxels deep, and empty within, as trained fields are.
 
-    A voxel's length takes half of the light at the unit ball.
+    A voxel's length takes away `LEVEL` of the light at the unit ball.
     """
     depth = 1.0 - away(points)
-    front = np.exp(depth / SOFT) * np.log(2.0) / VOXEL
+    front = np.exp(depth / SOFT) * -np.log(1.0 - LEVEL) / VOXEL
     return np.where(depth < 3.0 * VOXEL, np.minimum(front, DENSEST), 0.0)
 
 
@@ -47,7 +47,7 @@ def ball(views: list[DepthView]) -> TriangleMesh:
     return extract(sheet, views, BOUNDS, VOXEL)
 
 
-def test_the_surface_is_where_half_of_the_light_is_taken_and_faces_out(ball: TriangleMesh) -> None:
+def test_the_surface_is_where_so_much_light_is_taken_and_faces_out(ball: TriangleMesh) -> None:
     assert len(ball.faces) > 4000
     off = away(ball.vertices) - 1.0
     assert np.abs(off).max() < 0.25 * VOXEL
@@ -71,7 +71,7 @@ def test_vertices_lie_between_voxels_not_at_steps(ball: TriangleMesh) -> None:
     high = low.copy()
     high[rows, axis] += 1.0
     inner, outer = (1.0 - np.exp(-sheet(end * VOXEL + mid) * VOXEL) for end in (low, high))
-    share = (0.5 - inner) / (outer - inner)
+    share = (LEVEL - inner) / (outer - inner)
     inside = (share > 0.02) & (share < 0.98)
     assert inside.sum() > 1000
     assert np.abs((cells - low)[rows, axis] - share)[inside].max() < 0.01
@@ -108,7 +108,7 @@ def test_what_floats_where_no_view_sees_a_surface_is_not_even_asked(
 
 def test_a_lower_level_is_farther_out(views: list[DepthView], ball: TriangleMesh) -> None:
     """Where e times less dense is, SOFT farther out."""
-    lower = 1.0 - np.exp(-np.log(2.0) / np.e)
+    lower = 1.0 - (1.0 - LEVEL) ** (1.0 / np.e)
     out = extract(sheet, views, BOUNDS, VOXEL, level=float(lower))
     moved = away(out.vertices).mean() - away(ball.vertices).mean()
     assert moved == pytest.approx(SOFT, rel=0.3)

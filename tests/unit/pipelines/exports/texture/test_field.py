@@ -108,7 +108,7 @@ def test_a_ray_does_not_begin_behind_what_stands_before_it() -> None:
         np.full((4, 3), 0.5),
         np.tile([-1.0, 0.0, 0.0], (4, 1)),
     )
-    mesh = joined([painted_ball.ball(24), wall])
+    mesh = joined([painted_ball.ball(12), wall])
     skin = painted(mesh, scene_of(GlowingBall(wall=True)), pixel=0.031)
     points, found, _ = surface_samples(skin)
     tip = points[:, 0] - CENTER[0]
