@@ -124,6 +124,13 @@ class MeshOptions(CropOptions, TextureOptions):
         "beyond max_distance of more as voxels are larger; not those that cameras look through, "
         "nor the border of what was filmed. 0 for none.",
     )
+    watertight: bool = Field(
+        False,
+        description="Closes the mesh all over, so that each edge has two faces, as slicers of 3D "
+        "printers want it: the border gets a wall to a flat base. With extent=subject and stl "
+        "among the formats that is a thing to print, on its piece of table. It is done last: with "
+        "triangles there are a few more.",
+    )
     max_faces: int = Field(
         200_000,
         ge=100,
@@ -186,6 +193,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.surface.refinement import refined
     from pipelines.exports.surface.shells import Subject, affordable, find_shells, fuse_shells
     from pipelines.exports.surface.views import known_depths, render_views
+    from pipelines.exports.surface.watertight import is_closed, made_watertight, why_open
     from pipelines.exports.texture.bake import painted
     from pipelines.exports.texture.told import skin_told
     from pipelines.scene.depth_views import Pinhole
@@ -281,6 +289,14 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         told = _part_of(ctx, f"reducing {len(mesh.faces)} triangles", _REFINE_SHARE, _REDUCE_SHARE)
         told(0.0)
         mesh = reduced(mesh, options.triangles, told)
+    if options.watertight:
+        ctx.progress(_REDUCE_SHARE, "closing the mesh all over")
+        carrier = decision.thing.carried_by if decision and decision.thing else None
+        down = None if carrier is None else -carrier.normal
+        mesh = made_watertight(mesh, down, lambda done: ctx.check_cancelled())
+    watertight = is_closed(mesh.faces)
+    if options.watertight and not watertight:
+        ctx.logger.warning("The mesh is not watertight: %s", why_open(mesh.faces))
     each = (_TEXTURE_SHARE - _REDUCE_SHARE) / (1 + options.lods)
 
     def paint(shape: TriangleMesh, level: int) -> TriangleMesh | TexturedMesh:
@@ -328,6 +344,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
         "voxel": round(shells[0].voxel, 9),
         "coarser": coarser,
         "holes": closing.as_dict(),
+        "watertight": watertight,
         "subject": subject,
         "crop": told_crop,
         "bounds": shells[0].bounds.as_dict(),

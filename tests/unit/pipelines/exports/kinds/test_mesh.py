@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import open3d
 import pytest
+import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -16,6 +17,7 @@ from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.surface import poisson_solver, tsdf
+from pipelines.exports.surface import watertight as watertight_module
 from pipelines.exports.surface.borders import border_loops
 from pipelines.exports.texture import charts
 from pipelines.judging.asset_views import Texture
@@ -332,3 +334,22 @@ def test_holes_up_to_a_stated_size_are_closed_and_the_report_says_how_many(job: 
     count = len(before.faces)
     assert len(after.faces) > count
     np.testing.assert_array_equal(after.faces[:count], before.faces)
+
+
+def test_a_subject_to_be_printed_is_watertight_and_others_are_told_not_to_be(
+    job: Workspace, caplog: pytest.LogCaptureFixture
+) -> None:
+    wanted = {"texture": "none", "extent": "subject", "formats": ("stl",)}
+    for watertight in (False, True):
+        found = tiny_job.run(job, "mesh", watertight=watertight, **wanted)["summary"]
+        assert found["watertight"] is watertight
+        read = trimesh.load_mesh(job.stage("mesh") / "mesh.stl")
+        assert read.is_watertight is watertight
+        assert read.is_winding_consistent
+    assert "not watertight" not in caplog.text
+    monkey = pytest.MonkeyPatch()
+    with monkey.context() as patch:
+        patch.setattr(watertight_module, "made_watertight", lambda mesh, *others: mesh)
+        found = tiny_job.run(job, "mesh", watertight=True, **wanted)["summary"]
+    assert found["watertight"] is False
+    assert "The mesh is not watertight" in caplog.text
