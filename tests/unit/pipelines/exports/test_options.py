@@ -72,7 +72,7 @@ def test_an_export_has_exactly_the_formats_asked_for(
         ("mesh", {"formats": []}, "at least 1"),
         ("mesh", {"formats": ["glb", "fbx"]}, "'glb', 'ply', 'obj', 'stl' or 'usdz'"),
         ("mesh", {"up_axis": "x"}, "'z' or 'y'"),
-        ("mesh", {"method": "ball_pivoting"}, "'tsdf' or 'poisson'"),
+        ("mesh", {"method": "ball_pivoting"}, "'poisson' or 'marching_cubes'"),
         ("pointcloud", {"formats": []}, "at least 1"),
         ("pointcloud", {"formats": ["ply", "e57"]}, "'las', 'laz', 'xyz' or 'colmap'"),
         ("pointcloud", {"spacing": -0.1}, "greater than or equal to 0"),
