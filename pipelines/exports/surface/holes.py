@@ -29,7 +29,7 @@ from scipy.spatial.distance import pdist
 
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.surface.borders import Loop, border_loops
-from pipelines.exports.surface.patches import Patches, edges_of, fine_patches, spread_over
+from pipelines.exports.surface.hole_patches import Patches, edges_of, fine_patches, spread_over
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.shells import Shell
 from pipelines.exports.surface.triangulation import least_area

@@ -1,10 +1,10 @@
 """A mesh closed all over, for those who print it: each edge has two faces that go opposite ways.
 
 Where more than two faces meet at an edge they are taken away, and small loose pieces with them.
-Holes are closed as the surface goes on (`pipelines.exports.surface.patches`), however large, or
-with a flat lid. The border of what was filmed gets a wall to a flat base beyond all of its piece:
-under a thing that stands on a piece of table that is a plinth. Walls may cross each other where a
-border winds, and lids what lies in a hole.
+Holes are closed as the surface goes on (`pipelines.exports.surface.hole_patches`), however large,
+or with a flat lid. The border of what was filmed gets a wall to a flat base beyond all of its
+piece: under a thing that stands on a piece of table that is a plinth. Walls may cross each other
+where a border winds, and lids what lies in a hole.
 
 Symbols: V vertices, F faces, L vertices of a loop.
 """
