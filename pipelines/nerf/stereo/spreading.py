@@ -99,6 +99,7 @@ def spread(
             votes = np.where(depths[index] != z, votes, found[index].votes)
             found[index] = DepthMap(depths[index], votes.astype(np.uint8))
         on_progress(done / len(order))
+    on_progress(1.0)
     return found
 
 

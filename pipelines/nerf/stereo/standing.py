@@ -73,17 +73,13 @@ _MESSAGE = "standing walls up"
 
 
 @dataclass(frozen=True)
-class _Look:
-    """A view's open patches, and the places of their borders that have a known depth next to them.
+class _Look(PlainPatches):
+    """A view's plain patches, and the places of their borders that have a known depth next to them.
 
-    patches: [H, W]. open_patches: their numbers. Of each of K places: x, y, its ray at z = 1; the
-    patch; z: the depth that is known next to it, in another patch; plane: which one that lies on,
-    or -1.
+    Of each of K places: x, y, its ray at z = 1; the patch; z: the depth that is known next to it,
+    in another patch; plane: which one that lies on, or -1.
     """
 
-    view: StereoView
-    patches: Labels
-    open_patches: Numbers
     x: Floats
     y: Floats
     patch: Numbers
@@ -141,7 +137,7 @@ def stood_up(
         lambda done: on_progress(_LAY_SHARE + (_SPREAD_SHARE - _LAY_SHARE) * done, _MESSAGE),
     )
     return spread(
-        [PlainPatches(look.view, look.patches, look.open_patches) for look in looks],
+        looks,
         maps,
         laid,
         every[np.array(stands_on) >= 0],
@@ -356,7 +352,7 @@ def _laid(look: _Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> D
     """
     laid = z.copy()
     pixels = ray_grid(look.view)
-    for patch in np.intersect1d(look.open_patches, look.patch):
+    for patch in np.intersect1d(look.plain, look.patch):
         at = look.patch == patch
         depth, own = look.z[at], look.plane[at]
         relative = inverse_depths(look.view, planes, look.x[at], look.y[at]) * depth
