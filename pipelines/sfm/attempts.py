@@ -20,6 +20,15 @@ from pipelines.options import PosesOptions
 from pipelines.scene.panoramas import MODEL as PANORAMA
 from pipelines.sfm.agreement import MOST_MATCHES, MOST_PAIRS, agreement_of_model
 from pipelines.sfm.intrinsics import AUTO, FISHEYE, mapping_lens
+from pipelines.sfm.key_frames import (
+    clips_of_keys,
+    first_keys,
+    following,
+    is_worth_it,
+    key_pairs,
+    missing_keys,
+    placing_pairs,
+)
 from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
 from pipelines.sfm.report import Attempt, Outcome, check_features
 from pipelines.sfm.retrieval import (
@@ -40,7 +49,7 @@ from pipelines.tools.colmap import (
     Watch,
     extraction_threads,
 )
-from pipelines.tools.colmap_results import PairStatistics
+from pipelines.tools.colmap_results import PairStatistics, best_model
 
 NUM_PROBES = 5
 """Images, spread over the capture, whose features are counted before the rest."""
@@ -58,6 +67,13 @@ _FIRST, _LAST = 0.9, 0.97
 """Where in the stage's progress the first rung ends, and the last."""
 _FOUND, _MATCHED = 0.28, 0.56
 """Where in a rung's part of it the features are found, and the pairs matched."""
+_CHOSEN, _PLACED = 0.05, 0.96
+"""Where between those two key frames are chosen, and where in the rest all images are placed."""
+
+KEY_FRAMES = "key frames"
+"""The matcher of a film that is mapped by some of its frames."""
+_ENOUGH_KEYS = 0.5
+"""Share of the key frames that a model must hold for the other frames to be placed on it."""
 
 
 class Checkpoint:
@@ -178,7 +194,8 @@ class Ladder:
 
         Raises PosesError (no_features) before matching where images hold nothing to match.
         """
-        for rung, (start, end) in zip(self._rungs, _spans(len(self._rungs)), strict=True):
+        rungs = [rung for rung in self._rungs if rung.when(self._standing())]
+        for rung, (start, end) in zip(rungs, _spans(len(rungs)), strict=True):
             if not rung.when(self._standing()):
                 continue
             self._reconstructor = self._reconstructor.on(
@@ -192,12 +209,18 @@ class Ladder:
             if not self._attempts:
                 check_features(self._statistics, self._options)
             self._recognise_fisheyes(rung.matches, matcher)
-            self._match(rung.matches, matcher, (found, matched))
+            keys: list[int] = []
+            if rung.matches.key_frames:
+                chosen = found + _CHOSEN * (matched - found)
+                keys, found = self._key_frames((found, chosen)), chosen
+                if not keys:
+                    continue
+            self._match(rung.matches, matcher, keys, (found, matched))
             self._statistics = self._reconstructor.statistics()
             if not self._attempts and is_turning(self._statistics):
                 break
             self._start_focals()
-            self._map(rung, matcher, (matched, end))
+            self._map(rung, matcher, keys, (matched, end))
         return self.outcome
 
     def _standing(self) -> Standing:
@@ -207,11 +230,14 @@ class Ladder:
             best.num_registered,
             self._options.retry_below_ratio,
             is_contradicted=best.is_contradicted,
+            is_film=self._source.is_video and self._options.matcher in ("auto", "sequential"),
         )
 
     def _matcher(self, wanted: Matches) -> str:
-        """How this rung's pairs are chosen: sequential, exhaustive or retrieval."""
+        """How this rung's pairs are chosen: key frames, sequential, exhaustive or retrieval."""
         num = len(self._source.files)
+        if wanted.key_frames:
+            return KEY_FRAMES
         if wanted.all_pairs and num <= MAX_ALL_PAIRS:
             return "exhaustive"
         return choose_matcher(num, self._options.matcher, is_video=self._source.is_video)
@@ -262,6 +288,32 @@ class Ladder:
             pairs = sorted({*pairs, *found})
         return pairs
 
+    def _key_frames(self, span: Span) -> list[int]:
+        """The frames of a long film that are mapped; none where that would be most of them."""
+        num, clips = len(self._source.files), self._source.stretches
+        keys = first_keys(clips)
+        while is_worth_it(keys, num):
+            followers = following(keys, clips)
+            watch = self._progress.watch(span, len(followers), "choosing key frames by pair")
+            self._reconstructor.match(followers, watch)
+            missing = missing_keys(followers, self._reconstructor.statistics())
+            if not missing:
+                self._ctx.logger.info("%d of %d frames are key frames", len(keys), num)
+                return keys
+            keys = sorted({*keys, *missing})
+        self._ctx.logger.info("neighbouring frames differ too much to map a part of them")
+        return []
+
+    def _pairs_by_keys(self, keys: list[int]) -> Pairs:
+        options, clips = self._options, self._source.stretches
+        pairs = {*key_pairs(keys, clips, options.sequential_overlap), *placing_pairs(keys, clips)}
+        if len(clips) > 1:
+            alike = pairs_across(
+                self._vectors()[keys], clips_of_keys(keys, clips), options.retrieval_neighbours
+            )
+            pairs |= {(keys[i], keys[j]) for i, j in alike}
+        return sorted(pairs)
+
     def _vectors(self) -> Floats:
         """What each image looks like."""
         return image_vectors(self._reconstructor.features(FEATURES_PER_IMAGE), self._ctx.seed)
@@ -302,12 +354,12 @@ class Ladder:
         if num_found:
             self._checkpoint.save(step)
 
-    def _match(self, wanted: Matches, matcher: str, span: Span) -> None:
+    def _match(self, wanted: Matches, matcher: str, keys: list[int], span: Span) -> None:
         step = f"{wanted.database} {matcher}"
         if self._checkpoint.has(step):
             self._ctx.logger.info("%s matches are in the checkpoint", step)
             return
-        pairs = self._pairs(matcher)
+        pairs = self._pairs_by_keys(keys) if keys else self._pairs(matcher)
         watch = self._progress.watch(span, len(pairs), "matching pair")
         self._reconstructor.match(pairs, watch, thorough=wanted.thorough)
         self._checkpoint.save(step)
@@ -330,13 +382,25 @@ class Ladder:
             num_cameras,
         )
 
-    def _map(self, rung: Rung, matcher: str, span: Span) -> None:
+    def _map(self, rung: Rung, matcher: str, keys: list[int], span: Span) -> None:
         began = time.monotonic()
         num = len(self._source.files)
         settings = replace(rung.mapper, refine_principal_point=self._options.refine_principal_point)
-        models = self._reconstructor.map(settings, self._progress.watch(span, num, "placing image"))
+        placed = span[0] + _PLACED * (span[1] - span[0])
+        watch = self._progress.watch((span[0], placed), num, "placing image")
+        models = self._reconstructor.map(settings, watch, keys)
+        most = best_model(models)
+        if keys and most is not None and len(most.indices) >= _ENOUGH_KEYS * len(keys):
+            models = [
+                self._reconstructor.place(model, settings, watch) if model is most else model
+                for model in models
+            ]
+        compared = self._progress.watch((placed, span[1]), 3, "comparing poses with matches, part")
+        compared(1)
         seen = self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES)
+        compared(2)
         models = [replace(model, agreement=agreement_of_model(model, seen)) for model in models]
+        compared(3)
         attempt = Attempt(rung, matcher, tuple(models), time.monotonic() - began)
         self._attempts.append(attempt)
         self._ctx.logger.info(

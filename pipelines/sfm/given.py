@@ -230,7 +230,7 @@ class Judge:
             seen,
             error_px=max(judged.sampled.worst_px, before.worst_px),
             long_side_px=long_side_px,
-            run=self._reconstructor.runner(lambda: report(*shown)),
+            run=self._reconstructor.runner(lambda _: report(*shown)),
             num_threads=self._num_threads,
             seed=self._seed,
             report=say,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from pipelines.sfm.key_frames import LONG_FILM
 from pipelines.tools.colmap import MapperSettings, Thresholds
 
 MAX_ALL_PAIRS = 300
@@ -20,12 +21,14 @@ MAX_ALL_PAIRS = 300
 class Matches:
     """Features and matches: what a database of the checkpoint holds.
 
-    database: its name, unique among `Matches`. doubled: whether images are doubled before features
+    database: its name; who shares it shares features, too. key_frames: pairs of key frames, and of
+    the others with those around them. doubled: whether images are doubled before features
     are looked for; False leaves that to `poses.upsample`. all_pairs: of up to MAX_ALL_PAIRS images,
     instead of the pairs that were planned. thorough: COLMAP's own number of trials for a pair.
     """
 
     database: str
+    key_frames: bool = False
     doubled: bool = False
     all_pairs: bool = False
     thorough: bool = False
@@ -34,12 +37,14 @@ class Matches:
 @dataclass(frozen=True)
 class Standing:
     """How far the climb has come. num_registered: of the best attempt so far, 0 before any.
-    is_contradicted: whether matches contradict that one's model."""
+    is_contradicted: whether matches contradict that one's model. is_film: whether neighbours in the
+    list of images are neighbours in time, and may be chosen freely."""
 
     num_images: int
     num_registered: int
     wanted_ratio: float
     is_contradicted: bool = False
+    is_film: bool = False
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,16 @@ def always(standing: Standing) -> bool:
     return True
 
 
+def long_film(standing: Standing) -> bool:
+    """Where there are so many frames that most of them need not be mapped."""
+    return standing.is_film and standing.num_images >= LONG_FILM
+
+
+def not_yet_enough(standing: Standing) -> bool:
+    """Where nothing was registered yet, or too little."""
+    return standing.num_registered == 0 or too_few_registered(standing)
+
+
 def too_few_registered(standing: Standing) -> bool:
     """Where no attempt so far has registered the wanted share of images, or not believably."""
     return (
@@ -71,6 +86,7 @@ def too_few_registered(standing: Standing) -> bool:
     )
 
 
+_KEY_FRAMES = Matches("colmap", key_frames=True)
 _PLANNED = Matches("colmap")
 _ALL = Matches("thorough", doubled=True, all_pairs=True, thorough=True)
 _LOW = Thresholds(
@@ -82,9 +98,10 @@ _LOW = Thresholds(
 )
 
 RUNGS: tuple[Rung, ...] = (
-    Rung("quick", always, _PLANNED, MapperSettings()),
+    Rung("key frames", long_film, _KEY_FRAMES, MapperSettings()),
+    Rung("quick", not_yet_enough, _PLANNED, MapperSettings()),
     Rung("thorough", too_few_registered, _ALL, MapperSettings(thorough=True)),
     Rung("relaxed", too_few_registered, _ALL, MapperSettings(thorough=True, thresholds=_LOW)),
 )
-"""In the order of climbing; the first is always tried, and what it matched is looked at for a
-camera that only turned."""
+"""In the order of climbing; what the first that is tried matched is looked at for a camera that
+only turned."""

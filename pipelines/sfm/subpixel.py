@@ -29,7 +29,7 @@ from pipelines.options import PosesOptions
 from pipelines.sfm.alignment import Alignments, Arena
 from pipelines.sfm.source import Source
 from pipelines.tools.colmap import Reconstructor
-from pipelines.tools.colmap_adjustment import Rounds
+from pipelines.tools.colmap_adjustment import Rounds, share_done
 from pipelines.tools.colmap_results import SparseModel
 from pipelines.tools.colmap_tracks import Bools, Floats, Integers, StoredTracks, TrackPairs
 
@@ -94,15 +94,19 @@ def refine_model(
     possible, adjusted to the end with the keypoints it has, and None.
 
     Panoramas' keypoints stay: what a patch of theirs looks like from elsewhere is no affine map.
-    report: called while poses are adjusted, too.
+    report: called while poses are adjusted, too, which is the second half.
     """
-    tracks = reconstructor.stored_tracks(model, lambda: report(1.0))
+    report(0.0)
+    tracks = reconstructor.stored_tracks(
+        model, lambda rounds: report(0.5 + 0.5 * share_done(rounds))
+    )
+    report(0.05)
     refined = None
     if options.subpixel and not source.has_panoramas:
         refined = refine_keypoints(
             tracks,
             {image_id: source.paths[index] for image_id, index in tracks.indices.items()},
-            report,
+            lambda share: report(0.05 + 0.45 * share),
             long_side_px=options.max_image_px,
             num_threads=num_threads,
             refine_principal_point=options.refine_principal_point,

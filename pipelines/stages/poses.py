@@ -34,6 +34,7 @@ from pipelines.sfm.subpixel import refine_model
 from pipelines.stage import StageContext
 from pipelines.stages.given_poses import run_given
 from pipelines.tools.colmap import Reconstructor
+from pipelines.tools.colmap_adjustment import share_done
 from pipelines.tools.colmap_results import SparseModel
 from pipelines.workspace import SPARSE_POINTS
 
@@ -135,7 +136,7 @@ def _refine(
         model,
         source,
         options,
-        lambda share: ctx.progress(0.97 + 0.01 * share, "refining keypoints"),
+        lambda share: ctx.progress(0.97 + 0.01 * share, "adjusting all poses"),
         num_threads if num_threads > 0 else num_processors(),
     )
     if found is None:
@@ -158,7 +159,7 @@ def _settle_lenses(
     """The model with the lenses that fit it best, and what is known of each camera."""
     trials = reconstructor.lens_trials(
         model,
-        lambda: ctx.progress(0.98, "fitting the lens"),
+        lambda rounds: ctx.progress(0.98 + 0.01 * share_done(rounds), "fitting the lens"),
         refine_principal_point=options.refine_principal_point,
     )
     settled, lenses = settle_lenses(model, trials, options.camera_model)

@@ -33,6 +33,7 @@ from PIL import Image
 from pipelines.errors import ToolError
 from pipelines.tools.colmap_adjustment import Run
 from pipelines.tools.colmap_lenses import LensTrials
+from pipelines.tools.colmap_placing import place_others
 from pipelines.tools.colmap_probing import MatchedPairs, set_lens, start_focal
 from pipelines.tools.colmap_results import (
     Correspondences,
@@ -54,7 +55,8 @@ _POLL_S = 0.5
 _IMAGE_PORTION = 8
 _PAIR_TILE = 12
 """Pairs are taken in tiles of 12 x 12 images, whose features then stay in memory."""
-_PAIR_PORTION = 144
+_PAIR_PORTION = 72
+"""Pairs matched in one call, which nobody hears of before it ends: 2 seconds at `preview` sizes."""
 _SIFT_BYTES_PER_PX = 85
 """Measured: 75 to 87 per pixel, at 960 to 1,920 px, doubled or not, with one and two threads."""
 _QUICK_GROWTH = 1.4
@@ -257,13 +259,17 @@ class Reconstructor:
             lambda: watch(done),
         )
 
-    def map(self, settings: MapperSettings, watch: Watch) -> list[SparseModel]:
+    def map(
+        self, settings: MapperSettings, watch: Watch, only: Sequence[int] = ()
+    ) -> list[SparseModel]:
         """Incremental mapping with its bundle adjustments: all models, in COLMAP's order.
 
-        watch: receives the number of images placed so far.
+        watch: receives the number of images placed so far. only: these images, all where none is
+        named.
         """
         output = Path(tempfile.mkdtemp(prefix="models-", dir=self.scratch))
         options = self._mapping_options(settings)
+        options.image_names = [self.names[index] for index in only]
         placed = [0]
 
         def count_one() -> None:
@@ -287,10 +293,28 @@ class Reconstructor:
             if model.num_reg_images() > 1
         ]
 
+    def place(self, model: SparseModel, settings: MapperSettings, watch: Watch) -> SparseModel:
+        """A model that `map` found with all other images that can be placed on it, not adjusted.
+
+        watch: receives the number of images placed so far.
+        """
+        if model.stored is None:
+            raise ValueError("the model was not written by COLMAP")
+        whole = Path(tempfile.mkdtemp(prefix="placed-", dir=self.scratch))
+        found = place_others(
+            self.database,
+            model.stored,
+            self._mapping_options(settings),
+            links=self.links,
+            placed=watch,
+        )
+        found.write(whole)
+        return sparse_model(found, whole)
+
     def lens_trials(
-        self, model: SparseModel, poll: Callable[[], None], *, refine_principal_point: bool
+        self, model: SparseModel, watch: Watch, *, refine_principal_point: bool
     ) -> LensTrials:
-        """Trials of other lenses on a model that `map` found. poll: what it raises ends a trial."""
+        """Trials of other lenses on a model that `map` found. watch: see `runner`."""
         if model.stored is None:
             raise ValueError("the model was not written by COLMAP")
         return LensTrials(
@@ -298,7 +322,7 @@ class Reconstructor:
             refine_principal_point=refine_principal_point,
             num_threads=self.num_threads,
             seed=self.seed,
-            run=self.runner(poll),
+            run=self.runner(watch),
         )
 
     def matched(self, pairs: Sequence[tuple[int, int]]) -> MatchedPairs:
@@ -317,19 +341,28 @@ class Reconstructor:
         a call runs."""
         return start_focal(self.database, self.names, indices, long_sides)
 
-    def stored_tracks(self, model: SparseModel, poll: Callable[[], None]) -> StoredTracks:
-        """The tracks of a model that `map` found. poll: what it raises ends an adjustment."""
+    def stored_tracks(self, model: SparseModel, watch: Watch) -> StoredTracks:
+        """The tracks of a model that `map` found. watch: see `runner`."""
         if model.stored is None:
             raise ValueError("the model was not written by COLMAP")
-        return StoredTracks(
-            model.stored,
-            num_threads=self.num_threads,
-            run=self.runner(poll),
-        )
+        return StoredTracks(model.stored, num_threads=self.num_threads, run=self.runner(watch))
 
-    def runner(self, poll: Callable[[], None]) -> Run:
-        """What runs a long call of pycolmap beside `poll`, whose errors end it."""
-        return lambda what, call: self._run(what, call, poll)
+    def runner(self, watch: Watch) -> Run:
+        """What runs long calls of pycolmap beside `watch`, whose errors end them.
+
+        watch: receives the number of calls that have ended, also after each: an adjustment does not
+        let another thread run meanwhile.
+        """
+        ended = 0
+
+        def run(what: str, call: Callable[[Any], Any]) -> Any:
+            nonlocal ended
+            result = self._run(what, call, lambda: watch(ended))
+            ended += 1
+            watch(ended)
+            return result
+
+        return run
 
     def correspondences(self) -> Correspondences:
         """All verified matches, by features. Not while another call runs."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +12,10 @@ import pycolmap
 
 Run = Callable[[str, Callable[[Any], Any]], Any]
 """`(what, call)`: runs `call(token)` where it can be cancelled, and returns what it returns."""
+
+
+MANY_IMAGES = 100
+"""Images from which an iteration takes so long that rounds have fewer of them."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,17 @@ class Rounds:
     iterations: int
     rounds: int
     tolerance: float
+
+    def of(self, num_images: int) -> Rounds:
+        """As many iterations in shorter rounds, for a model of many images."""
+        each = max(1, self.iterations * MANY_IMAGES // max(num_images, MANY_IMAGES))
+        return Rounds(each, math.ceil(self.iterations * self.rounds / each), self.tolerance)
+
+
+def share_done(rounds: int) -> float:
+    """What share of adjustments to report after so many rounds: always more, never all, as nobody
+    knows beforehand when they end."""
+    return rounds / (rounds + 8.0)
 
 
 def adjust(
@@ -52,6 +68,7 @@ def adjust(
     options.ceres.loss_function_scale = loss_px
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = num_threads
+    ends = ends.of(reconstruction.num_reg_images())
     options.ceres.solver_options.max_num_iterations = ends.iterations
     options.ceres.solver_options.function_tolerance = ends.tolerance
     config = pycolmap.BundleAdjustmentConfig()

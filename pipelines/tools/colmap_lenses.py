@@ -12,7 +12,7 @@ by COLMAP's camera id.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,10 +29,15 @@ Floats = npt.NDArray[np.float64]
 MIN_TRACK = 4
 """Observations of a track of which some are held out, one in so many: at least three stay, of which
 two place the point and the third says where that is wrong."""
+MIN_SEEN = 2
+"""Images that a point needs to lie anywhere."""
 ENOUGH_OBSERVATIONS = 12_000
 ENOUGH_PER_IMAGE = 200
 """Tracks are taken until they have so many observations, whichever is more: enough to fix every
 pose and to tell lenses apart, and a fraction of what mapping adjusts many times (docs/poses.md)."""
+MOST_IMAGES, FEWEST_OF_CAMERA = 150, 20
+"""Images that tell of lenses, and how many of each camera at least, evenly out of all it took: a
+lens is told by as many of a long film as of a short one."""
 _ENDS = Rounds(iterations=10, rounds=5, tolerance=1e-6)
 """COLMAP's own tolerance goes on for 2 to 3 times as many rounds, for errors that are equal in four
 digits."""
@@ -82,8 +87,9 @@ class LensTrials:
         used = sorted({image.camera_id for image in images})
         self.cameras = {i: str(self._whole.camera(i).model.name) for i in used}
         self.num_views = {i: sum(image.camera_id == i for image in images) for i in used}
-        self._part = copy.deepcopy(self._whole)
-        held = self._hold_out(np.random.default_rng(seed), len(images))
+        told_by = _evenly_of_cameras(self._whole)
+        self._part = _part_of(self._whole, told_by)
+        held = self._hold_out(np.random.default_rng(seed), len(told_by))
         self._held_point = [point for point, _, _ in held]
         self._held_xy = np.array([xy for _, _, xy in held], np.float64).reshape(-1, 2)
         self.image_of = np.array([image for _, image, _ in held], np.int64)
@@ -184,6 +190,49 @@ class LensTrials:
             errors[seen] = np.linalg.norm(pixels.reshape(-1, 2) - self._held_xy[seen], axis=1)
         errors[~np.isfinite(errors)] = np.inf
         return errors
+
+
+def _evenly_of_cameras(whole: Any) -> list[int]:
+    """Of a model of many images MOST_IMAGES or a few more, ids ascending; all of any other."""
+    by_camera: dict[int, list[int]] = {}
+    for image_id in sorted(whole.reg_image_ids()):
+        by_camera.setdefault(whole.image(image_id).camera_id, []).append(image_id)
+    share = min(MOST_IMAGES / max(whole.num_reg_images(), 1), 1.0)
+    chosen: set[int] = set()
+    for image_ids in by_camera.values():
+        num = max(round(share * len(image_ids)), min(FEWEST_OF_CAMERA, len(image_ids)))
+        places = np.linspace(0, len(image_ids) - 1, num).round().astype(int)
+        chosen |= {image_ids[place] for place in places}
+    return sorted(chosen)
+
+
+def _part_of(whole: Any, image_ids: Sequence[int]) -> Any:
+    """A model of these images alone, without features that are of no track: a copy of it is light.
+
+    Images keep their ids, tracks the order of theirs.
+    """
+    part = pycolmap.Reconstruction()
+    for camera_id in sorted({whole.image(i).camera_id for i in image_ids}):
+        part.add_camera_with_trivial_rig(copy.deepcopy(whole.camera(camera_id)))
+    tracks: dict[int, Any] = {}
+    for image_id in image_ids:
+        image = whole.image(image_id)
+        seen = image.get_observation_points2D()
+        for index, point in enumerate(seen):
+            tracks.setdefault(point.point3D_id, pycolmap.Track()).add_element(image_id, index)
+        part.add_image_with_trivial_frame(
+            pycolmap.Image(
+                name=image.name,
+                keypoints=np.array([point.xy for point in seen]).reshape(-1, 2),
+                camera_id=image.camera_id,
+                image_id=image_id,
+            ),
+            image.cam_from_world(),
+        )
+    for point_id in sorted(tracks):
+        if tracks[point_id].length() >= MIN_SEEN:
+            part.add_point3D(whole.point3D(point_id).xyz, tracks[point_id])
+    return part
 
 
 def change_lens(camera: Any, lens: str) -> None:

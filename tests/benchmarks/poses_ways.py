@@ -52,7 +52,12 @@ OVERRIDES: dict[str, dict[str, Any]] = {
 """Ways that are the product's with other options."""
 WAYS = (DEFAULTS, *OVERRIDES, GLOBAL)
 
-_MESSAGES = {"features": "features", "matching": "matching", "placing": "mapping"}
+_MESSAGES = {
+    "features": "features",
+    "choosing": "matching",
+    "matching": "matching",
+    "placing": "mapping",
+}
 """First word of the stage's progress message -> phase."""
 
 
@@ -133,7 +138,7 @@ def our_way(
         )
         trials = reconstructor.lens_trials(
             model,
-            lambda: phases.on_progress(0.98, "placing", None),
+            lambda _: phases.on_progress(0.98, "placing", None),
             refine_principal_point=options.refine_principal_point,
         )
         model, _ = settle_lenses(model, trials, options.camera_model)

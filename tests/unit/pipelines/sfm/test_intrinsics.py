@@ -18,6 +18,7 @@ from pipelines.sfm.intrinsics import (
     lens_warnings,
     settle_lenses,
 )
+from pipelines.tools.colmap_adjustment import Rounds, share_done
 from pipelines.tools.colmap_lenses import LensTrials, change_lens
 from pipelines.tools.colmap_results import SparseModel, sparse_model
 from tests.unit.pipelines.sfm.synthetic_model import HEIGHT, WIDTH, Lens, trials_of
@@ -76,6 +77,37 @@ def test_cameras_are_judged_one_by_one(tmp_path: Path) -> None:
     model, found = settle(trials, tmp_path)
     assert sorted(each.lens for each in found) == ["RADIAL", "SIMPLE_RADIAL"]
     assert [lens.k2 == 0.0 for lens in model.cameras] == [True, False]
+
+
+def test_some_images_of_a_long_film_tell_its_lens_and_all_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.tools.colmap_lenses.MOST_IMAGES", 12)
+    monkeypatch.setattr("pipelines.tools.colmap_lenses.FEWEST_OF_CAMERA", 4)
+    film = [RADIAL] * 8 + [SIMPLE]
+    trials = trials_of(tmp_path, film, arc_deg=70, num_images=36)
+    assert len(np.unique(trials.image_of)) == 36, "four of each camera, which is all that each took"
+    trials = trials_of(tmp_path, [RADIAL, SIMPLE], arc_deg=70, num_images=36)
+    assert len(np.unique(trials.image_of)) == 12
+    model, found = settle(trials, tmp_path)
+    assert [(each.lens, each.num_images) for each in found] == [
+        ("RADIAL", 18),
+        ("SIMPLE_RADIAL", 18),
+    ]
+    assert found[0].focal_px == pytest.approx(520.0, rel=0.005)
+    assert model.indices == tuple(range(36))
+    assert model.error_px < 0.6
+
+
+def test_adjusting_many_images_ends_as_late_but_can_be_cancelled_as_soon() -> None:
+    ends = Rounds(iterations=10, rounds=5, tolerance=1e-6)
+    assert ends.of(100) == ends
+    assert ends.of(300) == Rounds(iterations=3, rounds=17, tolerance=1e-6)
+    assert ends.of(1000) == Rounds(iterations=1, rounds=50, tolerance=1e-6)
+    shares = [share_done(rounds) for rounds in range(100)]
+    assert shares == sorted(shares)
+    assert shares[0] == 0.0
+    assert shares[-1] < 1.0
 
 
 def test_a_camera_of_few_images_keeps_the_simplest_lens(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pytest
 
 from pipelines.tools.colmap import (
     CameraGroup,
@@ -93,3 +94,17 @@ def test_mapping_starts_from_a_focal_length_where_none_is_known(tmp_path: Path) 
         pair: len(places[0]) for pair, places in before.items()
     }
     assert reconstructor.start_focal([0, 1, 2], 0.9) == 0
+
+
+def test_who_watches_long_calls_hears_of_each_that_ended(tmp_path: Path) -> None:
+    """An adjustment holds the interpreter: nobody could ask while it runs."""
+    heard: list[int] = []
+    run = Reconstructor(tmp_path / "none.db", [], tmp_path).runner(heard.append)
+    assert [run("adjusting", lambda _token: "done") for _ in range(2)] == ["done", "done"]
+    assert [num for num in heard if num > 0] == [1, 2]
+
+    def stop(_ended: int) -> None:
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        Reconstructor(tmp_path / "none.db", [], tmp_path).runner(stop)("adjusting", lambda _: None)
