@@ -75,6 +75,12 @@ class TextureOptions(StageOptions):
         description="Largest side of that picture; it is no larger than the photos need, or the "
         "field, which knows no more than the pixels that it was trained on.",
     )
+    refine_texture: bool = Field(
+        True,
+        description="Moves the colours of texture=photos towards what all photos that see a place "
+        "show of it, but for the finest detail. Off, each face has one photo's, sharp and a "
+        "little off in the others.",
+    )
 
 
 _World = Annotated[float, Field(ge=-1e8, le=1e8)]

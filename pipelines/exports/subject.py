@@ -144,13 +144,23 @@ class Thing:
 
 @dataclass(frozen=True)
 class Decision:
-    """kind: what was filmed. why: in words. measures: the numbers behind it. thing: where kind is
-    subject, or where it was asked for all the same and something is there."""
+    """kind: what was filmed. why: in words. measures: the numbers behind it, as far as it came.
+    thing: where kind is subject, or where it was asked for all the same and something is there."""
 
     kind: Kind
     why: str
     measures: dict[str, Any] = field(default_factory=dict)
     thing: Thing | None = None
+
+
+@dataclass(frozen=True)
+class Told:
+    """What cameras alone say. why: they did not walk round anything; None where they may have.
+    where: the focus [3] and their mean distance to it, if they have one."""
+
+    why: str | None
+    measures: dict[str, Any] = field(default_factory=dict)
+    where: tuple[Floats, float] | None = None
 
 
 def find_subject(
@@ -164,18 +174,18 @@ def find_subject(
     fallback: where to look for a thing, and how far cameras are from there, where the cameras look
     at no point: then the kind is scene, but what stands there is told.
     """
-    measures: dict[str, Any] = {}
-    why = None
-    focus = find_focus(gaze.poses) if len(gaze.poses) >= 3 else None
-    if focus is None:
-        why = "The cameras do not look at one point: they face one way, or look about."
-        if fallback is None:
-            return Decision("scene", why, measures)
+    told = told_by_cameras(gaze)
+    measures, why = dict(told.measures), told.why
+    if told.where is not None:
+        focus, distance = told.where
+        if why is None:
+            near = _near_share(vertices, faces, gaze, focus)
+            measures["near"] = round(near, 3)
+            if near < LEAST_NEAR:
+                why = f"Only {near:.0%} of what the middles of the pictures show is where they all "
+                why += "look."
+    elif fallback is not None:
         focus, distance = fallback
-    else:
-        distance = float(np.linalg.norm(gaze.poses[:, :, 3] - focus, axis=1).mean())
-        why = _unlike_a_walk_round(vertices, faces, gaze, focus, distance, measures)
-        measures["distance"] = round(distance, 6)
     if why is not None and fallback is None:
         return Decision("scene", why, measures)
     cells = cells_of(vertices, faces, focus, distance)
@@ -187,29 +197,29 @@ def find_subject(
     return Decision("subject", "The cameras stand around a thing and look at it.", measures, thing)
 
 
-def _unlike_a_walk_round(
-    vertices: Floats,
-    faces: NDArray[np.integer[Any]],
-    gaze: Gaze,
-    focus: Floats,
-    distance: float,
-    measures: dict[str, Any],
-) -> str | None:
-    """Why cameras with a focus did not walk round anything; None where they may have."""
+def told_by_cameras(gaze: Gaze) -> Told:
+    """What cameras alone say, before anything is known of what they saw."""
+    focus = find_focus(gaze.poses) if len(gaze.poses) >= 3 else None
+    if focus is None:
+        return Told("The cameras do not look at one point: they face one way, or look about.")
     away = gaze.poses[:, :, 3] - focus
-    toward = -away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
+    far = np.linalg.norm(away, axis=1)
+    toward = -away / np.maximum(far[:, None], 1e-300)
     cosine = -(gaze.poses[:, :, 2] * toward).sum(axis=1)
     looking = float((cosine > np.cos(np.radians(30.0))).mean())
     arc = float(np.degrees(np.arccos(np.clip((toward @ toward.T).min(), -1.0, 1.0))))
-    near = _near_share(vertices, faces, gaze, focus)
-    measures |= {"looking": round(looking, 3), "arc_deg": round(arc, 1), "near": round(near, 3)}
+    where = focus, float(far.mean())
+    measures = {
+        "looking": round(looking, 3),
+        "arc_deg": round(arc, 1),
+        "distance": round(where[1], 6),
+    }
+    why = None
     if looking < LEAST_LOOKING:
-        return f"Only {looking:.0%} of the cameras look at what the others do."
-    if arc < LEAST_ARC_DEG:
-        return f"The cameras see it from directions within {arc:.0f} degrees."
-    if near < LEAST_NEAR:
-        return f"Only {near:.0%} of what the middles of the pictures show is where they all look."
-    return None
+        why = f"Only {looking:.0%} of the cameras look at what the others do."
+    elif arc < LEAST_ARC_DEG:
+        why = f"The cameras see it from directions within {arc:.0f} degrees."
+    return Told(why, measures, where)
 
 
 def _near_share(

@@ -1,28 +1,30 @@
-"""The subject sought beforehand, on a coarse surface: for exports that are to hold it alone.
+"""What was filmed, decided once for an export and in one way for all of them.
 
-The rule (`pipelines.exports.subject`) wants a surface, and what is made within the thing's region
-wants the region first. So small views of the trained scene are fused once, the same for every kind
-of export, whatever its extent and size: a mesh and a cloud of one job find the same thing in the
-same place.
+The rule (`pipelines.exports.subject`) wants a surface, and who makes what is within the thing's
+region wants the region first. So a coarse surface is fused of a few small views, of the trained
+scene or, before there is one, of depth maps. It depends on these and on the cameras alone, not on
+what an export is asked for: neither on its kind, extent, size and rendering, nor on the maps that
+vote in it. A mesh and a cloud of one job are of the same thing, at once and months later.
 """
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.exports.subject import Decision, find_subject
+import numpy as np
+
+from pipelines.exports.subject import Decision, Gaze, find_subject, told_by_cameras
 from pipelines.exports.subject_files import gaze_of
 from pipelines.exports.surface.shells import Subject, find_shells, fuse_shells
-from pipelines.exports.surface.views import render_views
+from pipelines.exports.surface.views import known_depths, render_views
+from pipelines.scene.bounds import bounds_of_views
 from pipelines.scene.depth_views import Pinhole
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipelines.scene.depth_views import DepthView
-    from pipelines.scene.known_depths import KnownDepths
+    from pipelines.scene.depth_views import DepthView, ViewStore
     from pipelines.scene.trained_scene import TrainedScene
     from pipelines.stage import StageContext
 
@@ -39,49 +41,66 @@ _RENDERED = 0.8
 
 
 def search_subject(
-    scene: TrainedScene,
-    probes: Sequence[DepthView],
-    known: KnownDepths | None,
-    ctx: StageContext,
-    insist: bool = False,
+    scene: TrainedScene, probes: Sequence[DepthView], ctx: StageContext, insist: bool = False
 ) -> Decision:
     """Whether somebody walked round a thing, and where it is.
 
-    probes: `scene.probe_views()`. known: maps that vote beside the field. insist: to look for what
-    stands where the cameras look also where nobody walked round anything.
+    probes: `scene.probe_views()`. insist: to look for what stands where the cameras look also where
+    nobody walked round anything; what was filmed is decided as without it.
     """
-    images = scene.training_images(_NUM_VIEWS)
-    lenses = [Pinhole.of(scene.lens_of(image), _LONG_SIDE_PX) for image in images]
-    shells = find_shells(
-        lambda distance: scene.bounds(distance, ctx.check_cancelled, probes),
-        _NEAR,
-        _FAR,
-        _RESOLUTION,
-        Subject(_FINE, max(1.0 / lens.fl_x for lens in lenses), probes),
-    )
-    if not shells:
-        return Decision("scene", "The views show no surface.")
+    shown = scene.training_images()
+    gaze = gaze_of(shown, [scene.lens_of(image) for image in shown])
+    told = told_by_cameras(gaze)
+    if told.why is not None and not insist:
+        return Decision("scene", told.why, told.measures)
+    plain = scene.by_default()
+    if plain is not scene:
+        probes = plain.probe_views(ctx.check_cancelled)
+    images = plain.training_images(_NUM_VIEWS)
+    lenses = [Pinhole.of(plain.lens_of(image), _LONG_SIDE_PX) for image in images]
+    known = known_depths(ctx.workspace, "auto")
     rendered = _RENDERED * SEARCH_SHARE
     with tempfile.TemporaryDirectory(dir=ctx.out, prefix=".search-") as folder:
         words = "looking for the subject, view"
         store = render_views(
-            scene, images, lenses, Path(folder), ctx, (0.0, rendered), known, words
+            plain, images, lenses, Path(folder), ctx, (0.0, rendered), known, words
         )
-        mesh = fuse_shells(
+        return decide_on(
             store,
-            shells,
-            _MAX_FACES,
+            probes,
+            gaze,
             lambda done: ctx.progress(
                 rendered + (SEARCH_SHARE - rendered) * done, "looking for the subject", None
             ),
+            insist,
         )
+
+
+def decide_on(
+    views: ViewStore,
+    probes: Sequence[DepthView],
+    gaze: Gaze,
+    on_progress: Callable[[float], None],
+    insist: bool,
+) -> Decision:
+    """The same by views that are there: of a trained scene, or depth maps.
+
+    probes: some of them, or smaller ones. gaze: all cameras. on_progress: told the share that is
+    done; may raise.
+    """
+    pixel = max(1.0 / view.lens.fl_x for view in views)
+    shells = find_shells(
+        lambda distance: bounds_of_views(probes, np.asarray(gaze.poses), distance),
+        _NEAR,
+        _FAR,
+        _RESOLUTION,
+        Subject(_FINE, pixel, probes),
+    )
+    if not shells:
+        return Decision("scene", "The views show no surface.")
+    mesh = fuse_shells(views, shells, _MAX_FACES, on_progress)
     if len(mesh.faces) == 0:
         return Decision("scene", "The views agree on no surface.")
-    shown = scene.training_images()
     bounds = shells[0].bounds
-    return find_subject(
-        mesh.vertices,
-        mesh.faces,
-        gaze_of(shown, [scene.lens_of(image) for image in shown]),
-        (bounds.focus, bounds.distance) if insist else None,
-    )
+    fallback = (bounds.focus, bounds.distance) if insist else None
+    return find_subject(mesh.vertices, mesh.faces, gaze, fallback)

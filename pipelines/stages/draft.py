@@ -9,6 +9,7 @@ on, its mesh comes from training. A job that trains nothing asks for more (`draf
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,15 @@ from pipelines.exports.formats import glb
 from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import reach_of
-from pipelines.exports.subject import find_subject
+from pipelines.exports.subject import Decision
 from pipelines.exports.subject_files import as_dict, gaze_of
+from pipelines.exports.subject_search import decide_on
 from pipelines.exports.surface.shells import find_shells, fuse_shells
 from pipelines.exports.texture.bake import painted
 from pipelines.judging.asset_views import MeshCaster, Texture
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.options import DraftOptions
-from pipelines.scene.bounds import SceneBounds, bounds_of_views
+from pipelines.scene.bounds import bounds_of_views
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_views import DepthView, Floats, Pinhole, ViewStore
@@ -68,11 +70,12 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
             options.max_faces,
             lambda done: ctx.progress(_LOAD_SHARE + share * done, "fusing depth", None),
         )
+        decision = _decided(views, probes, cameras, ctx) if options.extent == "subject" else None
     if len(mesh.faces) == 0:
         return _nothing(options, ctx, "no two depth maps agree on a surface")
     subject = None
-    if options.extent == "subject":
-        mesh, subject = _alone(mesh, cameras, shells[0].bounds, ctx)
+    if decision is not None:
+        mesh, subject = _alone(mesh, decision, ctx), as_dict(decision)
         if len(mesh.faces) == 0:
             return _nothing(options, ctx, "nothing is left of the subject")
     skin = _painted(mesh, maps, cameras, options, ctx)
@@ -87,24 +90,22 @@ def run(options: DraftOptions, ctx: StageContext) -> dict[str, Any]:
     }
 
 
-def _alone(
-    mesh: TriangleMesh, cameras: CamerasFile, near: SceneBounds, ctx: StageContext
-) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The thing in the mesh with what it stands on, and what is told of it.
-
-    All of the mesh where none is found.
-    """
+def _decided(
+    views: ViewStore, probes: Sequence[DepthView], cameras: CamerasFile, ctx: StageContext
+) -> Decision:
+    """What was filmed, by the maps: decided as it will be by the trained scene."""
+    ctx.progress(_FUSE_SHARE, "looking for the subject")
     lenses = [cameras.cameras[image.camera] for image in cameras.images]
-    decision = find_subject(
-        mesh.vertices,
-        mesh.faces,
-        gaze_of(list(cameras.images), lenses),
-        (near.focus, near.distance),
-    )
+    gaze = gaze_of(list(cameras.images), lenses)
+    return decide_on(views, probes, gaze, lambda done: ctx.check_cancelled(), insist=True)
+
+
+def _alone(mesh: TriangleMesh, decision: Decision, ctx: StageContext) -> TriangleMesh:
+    """The thing in the mesh with what it stands on; all of the mesh where none was found."""
     if decision.thing is None:
         ctx.logger.warning("No subject was found; the draft is what lies within max_distance.")
-        return mesh, as_dict(decision)
-    return cut_out(mesh, decision.thing), as_dict(decision)
+        return mesh
+    return cut_out(mesh, decision.thing)
 
 
 def _nothing(options: DraftOptions, ctx: StageContext, why: str) -> dict[str, Any]:

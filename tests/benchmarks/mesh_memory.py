@@ -7,7 +7,8 @@ Each row is a process of its own, with no model in it: analytic depth views of a
 resolution, bounds included, as `mesh` does it (cleaned and reduced to 200,000 triangles); the ball
 painted with 24 photos of 3000 px; a ball of many triangles reduced to a tenth. `beyond` is what the
 peak is above the process before; children are told apart. The longest pause is the longest time
-between two reports of progress that moved, within which nobody can cancel either.
+between two reports of progress that moved, within which nobody can cancel either; `of CPU` is the
+most that this process computed in such a time, which others on the machine do not lengthen.
 """
 
 from __future__ import annotations
@@ -43,20 +44,26 @@ class Row:
     child_bytes: int
     wall_s: float
     longest_pause_s: float
+    longest_pause_cpu_s: float
     told: str
 
 
 class Watch:
-    """What is told of progress: the longest time in which nothing moved."""
+    """What is told of progress: the longest time in which nothing moved, from the first word on."""
 
     def __init__(self) -> None:
-        self.longest_s, self._last, self._at = 0.0, -1.0, time.monotonic()
+        self.longest_s = self.longest_cpu_s = 0.0
+        self._last: float | None = None
+        self._at = self._cpu_at = 0.0
 
     def __call__(self, done: float) -> None:
-        if done > self._last:
-            now = time.monotonic()
+        now, cpu = time.monotonic(), time.process_time()
+        if self._last is not None:
+            if done <= self._last:
+                return
             self.longest_s = max(self.longest_s, now - self._at)
-            self._last, self._at = done, now
+            self.longest_cpu_s = max(self.longest_cpu_s, cpu - self._cpu_at)
+        self._last, self._at, self._cpu_at = done, now, cpu
 
 
 def fused(num_views: int, resolution: int, watch: Watch) -> str:
@@ -131,7 +138,8 @@ def measure_here(label: str, work: Callable[[Watch], str]) -> Row:
     told = work(watch)
     wall_s = time.monotonic() - begun
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-    return Row(label, before, peak_memory_bytes(), children, wall_s, watch.longest_s, told)
+    peak, pauses = peak_memory_bytes(), (watch.longest_s, watch.longest_cpu_s)
+    return Row(label, before, peak, children, wall_s, *pauses, told)
 
 
 def work_of(label: str, num_views: int) -> Callable[[Watch], str]:
@@ -166,10 +174,20 @@ def print_report(rows: list[Row]) -> None:
             number(row.child_bytes / MIB, 0),
             number(row.wall_s, 1),
             number(row.longest_pause_s, 1),
+            number(row.longest_pause_cpu_s, 1),
         ]
         for row in rows
     ]
-    header = ["work", "", "before MiB", "beyond MiB", "child MiB", "s", "longest pause s"]
+    header = [
+        "work",
+        "",
+        "before MiB",
+        "beyond MiB",
+        "child MiB",
+        "s",
+        "longest pause s",
+        "of CPU s",
+    ]
     print("\n" + markdown_table(header, cells))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,9 +17,15 @@ from tests.samples import sample_clip
 
 
 @contextmanager
-def running(home: Path, cache: Path) -> Iterator[tuple[Client, Embedded, Supervisor]]:
-    """The embedded service on a free port, stopped at the end whatever happens."""
+def running(
+    home: Path, cache: Path, before: Callable[[Embedded], None] = lambda embedded: None
+) -> Iterator[tuple[Client, Embedded, Supervisor]]:
+    """The embedded service on a free port, stopped at the end whatever happens.
+
+    before: called with what is prepared, when nothing of it runs yet.
+    """
     embedded = Embedded.at(home, "127.0.0.1", free_port(), cache)
+    before(embedded)
     supervisor = embedded.supervisor(print)
     supervisor.start()
     try:

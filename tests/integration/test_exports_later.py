@@ -9,27 +9,16 @@ from typing import Any
 import pytest
 
 from pipelines.nerf.engines.cpu.parts.runtime import CACHE_FOLDER
-from pipelines.registry import STAGES, get_stage
-from pipelines.workspace import Workspace
-from storage.claims import claim_stage
-from storage.deletions import drain_deletions
+from pipelines.registry import get_stage
 from storage.exports import create_export, open_for_export
-from storage.jobs import StageSeed, create_job, ready_stage_ids, stage_id
-from storage.keys import attempt_prefix, blob_content
-from storage.leases import succeed_stage
-from storage.models import Job, new_id
-from storage.records import create_capture, delete_capture
-from storage.tenants import DEFAULT_TENANT
+from storage.jobs import ready_stage_ids
 from tests.integration.engine import Engine
 from tests.services import RedisServer, S3Endpoint
+from tests.trained_jobs import trained_job
 from tests.unit.pipelines.stages import tiny_job
-from worker.transfer import upload_folder
 
 pytestmark = [pytest.mark.services, pytest.mark.timeout(600)]
 
-SEED = 3
-"""That of `tiny_job.run`, whose files are those that are wanted."""
-MADE = ("ingest", "train")
 WANTED: dict[str, dict[str, Any]] = {
     "mesh": {"crop": {"shape": "auto"}},
     "pointcloud": {"extent": "subject", "formats": ["ply", "xyz"]},
@@ -54,59 +43,6 @@ def engine(
     made.close()
 
 
-def _publish(engine: Engine, job: Job, name: str, workspace: Workspace) -> None:
-    """What the worker that made a stage did with its folder."""
-    with engine.database.session_scope() as session:
-        claim = claim_stage(session, stage_id(job.id, name), "first", 60.0)
-    assert claim is not None
-    prefix = attempt_prefix(job.object_root, name, claim.attempt, claim.token)
-    upload_folder(
-        engine.store, workspace.stage(name), prefix, lambda: None, workers=2, step="publish"
-    )
-    with engine.database.session_scope() as session:
-        manifest = workspace.manifest(name)
-        succeed_stage(session, claim, manifest=manifest, output_prefix=prefix)
-
-
-def _trained_job(engine: Engine, workspace: Workspace) -> str:
-    """A job of which nothing is left but what its stages published: its capture is deleted."""
-    source = engine.folder / "tiny.zip"
-    source.write_bytes(b"tiny")
-    capture_id = new_id()
-    key = blob_content(DEFAULT_TENANT, "0" * 64, capture_id)
-    engine.store.put_file(key, source)
-    with engine.database.session_scope() as session:
-        create_capture(
-            session,
-            capture_id=capture_id,
-            filename=source.name,
-            kind="nerfstudio",
-            num_bytes=4,
-            sha256="0" * 64,
-            brought=key,
-            details={},
-        )
-        job = create_job(
-            session,
-            capture_id=capture_id,
-            preset="preview",
-            preset_reason="test",
-            options={stage.name: tiny_job.options_of(stage.name) for stage in STAGES},
-            stages=[
-                StageSeed(stage.name, stage.after, skipped=stage.name not in MADE)
-                for stage in STAGES
-            ],
-            seed=SEED,
-        )
-    for name in MADE:
-        _publish(engine, job, name, workspace)
-    with engine.database.session_scope() as session:
-        delete_capture(session, capture_id)
-    drain_deletions(engine.database, engine.store)
-    assert not engine.store.exists(key)
-    return job.id
-
-
 def _ask(engine: Engine, job_id: str, kind: str, changes: dict[str, Any]) -> str:
     options = tiny_job.options_of(kind, **changes)
     with engine.database.session_scope() as session:
@@ -121,7 +57,7 @@ def test_what_is_asked_for_later_is_what_the_job_would_have_made(
 ) -> None:
     workspace = tiny_job.make_capture(tmp_path / "first machine")
     tiny_job.run(workspace, "train")
-    job_id = _trained_job(engine, workspace)
+    job_id = trained_job(engine.database, engine.store, engine.folder, workspace)
     engine.start_worker()
     asked = {kind: _ask(engine, job_id, kind, changes) for kind, changes in WANTED.items()}
     elsewhere = {"crop": {"shape": "sphere", "center": [0.0, 0.0, 300.0], "radius": 1.0}}

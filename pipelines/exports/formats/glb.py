@@ -7,7 +7,8 @@ linear (glTF 2.0, section 3.7.2.1), our colours are sRGB: they are converted, in
 dark tones keep their steps. A texture is a JPEG, which is sRGB as base colours are, and lies in the
 file. A capture's colours contain the light, hence KHR_materials_unlit.
 
-Source: Khronos, glTF 2.0 specification; KHR_materials_unlit.
+Source: Khronos, glTF 2.0 specification; KHR_materials_unlit, KHR_mesh_quantization,
+EXT_meshopt_compression.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipelines.exports.formats import meshopt
 from pipelines.exports.frame import FROM_WORLD, Frame, back_to_world, is_far
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 
@@ -32,6 +34,7 @@ _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT32, _UINT16, _INT8 = 5126, 5125, 5123, 5120
 _STEPS = 65535.0
 _QUANTIZATION = "KHR_mesh_quantization"
+_COMPRESSION = "EXT_meshopt_compression"
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
 _JPEG_QUALITY = 92
@@ -66,6 +69,33 @@ class _Accessor:
     component: int
     normalized: bool = False
     padded: bool = False
+
+    @property
+    def stride(self) -> int:
+        """Bytes of a row."""
+        return self.values.strides[0] if self.name else self.values.itemsize
+
+    def compressed(self) -> bytes:
+        """Its content as the second buffer has it in the first one."""
+        if not self.name:
+            return meshopt.encode_indices(self.values.ravel())
+        rows = np.ascontiguousarray(self.values).view(np.uint8)
+        return meshopt.encode_attributes(rows.reshape(len(self.values), self.stride))
+
+    def compressed_view(self, offset: int, at: int, length: int) -> dict[str, Any]:
+        """Its buffer view, where `length` bytes of the file at `at` stand for those at `offset`."""
+        plain = self.view(offset) | {"buffer": 1}
+        if self.name:
+            plain["byteStride"] = self.stride
+        stored = {
+            "buffer": 0,
+            "byteOffset": at,
+            "byteLength": length,
+            "byteStride": self.stride,
+            "count": self.values.nbytes // self.stride,
+            "mode": "ATTRIBUTES" if self.name else "INDICES",
+        }
+        return plain | {"extensions": {_COMPRESSION: stored}}
 
     def view(self, offset: int) -> dict[str, Any]:
         """Its buffer view."""
@@ -108,11 +138,22 @@ def srgb_from_linear(linear: Floats) -> Floats:
 class GlbStyle:
     """unlit: colours as they are, which hold the light of the capture; else a rough surface that
     the viewer's lamps light. quantized: places in 65535 steps of the longest side and half the
-    bytes a vertex (`KHR_mesh_quantization`), for viewers that know it.
+    bytes a vertex (`KHR_mesh_quantization`), for viewers that know it. compressed: so, and what is
+    left in half the bytes once more (`EXT_meshopt_compression`), for those that can read that.
     """
 
     unlit: bool = True
     quantized: bool = False
+    compressed: bool = False
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether places are whole numbers."""
+        return self.quantized or self.compressed
+
+    def extensions(self) -> list[str]:
+        """What a reader must know to show anything."""
+        return [_QUANTIZATION] * self.in_steps + [_COMPRESSION] * self.compressed
 
 
 def write_mesh(
@@ -137,7 +178,7 @@ def write_mesh(
     frame = frame.y_up()
     places, directions = frame.of_world(vertices), frame.of_world(unit_normals(normals))
     node: dict[str, Any] = {"mesh": 0, "name": "scene"}
-    if style.quantized:
+    if style.in_steps:
         low, size = places.min(axis=0), max(float(np.ptp(places, axis=0).max()), 1e-12)
         node |= {"translation": low.tolist(), "scale": [size] * 3}
         shape = [
@@ -155,13 +196,18 @@ def write_mesh(
         ]
     accessors = [
         *shape,
-        _colored(mesh, style.quantized),
+        _colored(mesh, style.in_steps),
         _Accessor("", faces.astype("<u4"), "SCALAR", _UINT32),
     ]
     picture = jpeg(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
-    # Arrays are multiples of 4 bytes by their types; the picture comes last and is padded.
-    blobs = [accessor.values.tobytes() for accessor in accessors] + [picture] * bool(picture)
-    document = _document(accessors, len(picture), frame, node, style)
+    # Arrays are multiples of 4 bytes by their types, or made so; the picture comes last.
+    arrays = [
+        accessor.compressed() if style.compressed else accessor.values.tobytes()
+        for accessor in accessors
+    ]
+    blobs = [array + b"\0" * (-len(array) % 4) for array in arrays] + [picture] * bool(picture)
+    lengths = [len(array) for array in arrays]
+    document = _document(accessors, lengths, len(picture), frame, node, style)
     text = json.dumps(document, separators=(",", ":")).encode("utf-8")
     text += b" " * (-len(text) % 4)
     binary = b"".join(blobs)
@@ -182,10 +228,7 @@ def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
     """
     document, binary = _parts(path)
     try:
-        views = [
-            binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-            for view in document["bufferViews"]
-        ]
+        views = [_content(view, binary) for view in document["bufferViews"]]
         (primitive,) = document["meshes"][0]["primitives"]
         at = primitive["attributes"]
         kinds = [accessor["componentType"] for accessor in document["accessors"]]
@@ -207,6 +250,20 @@ def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
     except (KeyError, IndexError, TypeError, OSError, ValueError) as error:
         raise ValueError(f"{path.name} is no mesh of ours: {error}") from error
     return TexturedMesh(position, faces, normal, uv, texture)
+
+
+def _content(view: dict[str, Any], binary: memoryview) -> memoryview:
+    """The bytes of a buffer view."""
+    stored = view.get("extensions", {}).get(_COMPRESSION)
+    at = stored or view
+    data = binary[at["byteOffset"] : at["byteOffset"] + at["byteLength"]]
+    if stored is None:
+        return data
+    if stored["mode"] == "INDICES":
+        whole = meshopt.decode_indices(data, stored["count"]).astype("<u4").tobytes()
+    else:
+        whole = meshopt.decode_attributes(data, stored["count"], stored["byteStride"]).tobytes()
+    return memoryview(whole)
 
 
 def _in_world(
@@ -278,17 +335,24 @@ def jpeg(texture: NDArray[np.uint8]) -> bytes:
 
 def _document(
     accessors: list[_Accessor],
+    lengths: list[int],
     picture_bytes: int,
     frame: Frame,
     node: dict[str, Any],
     style: GlbStyle,
 ) -> dict[str, Any]:
-    """The JSON part. picture_bytes: of the texture behind all arrays, 0 for none."""
+    """The JSON part. lengths: of the arrays in the file, which come one after the other, each from
+    a multiple of 4. picture_bytes: of the texture behind all arrays, 0 for none."""
     views: list[dict[str, Any]] = []
-    total = 0
-    for accessor in accessors:
-        views.append(accessor.view(total))
-        total += accessor.values.nbytes
+    total = whole = 0
+    for accessor, length in zip(accessors, lengths, strict=True):
+        views.append(
+            accessor.compressed_view(whole, total, length)
+            if style.compressed
+            else accessor.view(total)
+        )
+        whole += accessor.values.nbytes
+        total += length + -length % 4
     if picture_bytes:
         views.append({"buffer": 0, "byteOffset": total, "byteLength": picture_bytes})
         total += picture_bytes
@@ -296,14 +360,17 @@ def _document(
     material = {
         key: value for key, value in _MATERIAL.items() if style.unlit or key != "extensions"
     }
-    used = ["KHR_materials_unlit"] * style.unlit + [_QUANTIZATION] * style.quantized
+    required = style.extensions()
+    used = ["KHR_materials_unlit"] * style.unlit + required
+    # What stands for the arrays as they are unpacked: it is nowhere, and has a length.
+    unpacked = {"byteLength": whole, "extensions": {_COMPRESSION: {"fallback": True}}}
     extras: dict[str, Any] = {"frame": frame.note()}
     if (matrix := frame.matrix()) is not None:
         extras[FROM_WORLD] = matrix.tolist()
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "nerfworks", "extras": extras},
         **({"extensionsUsed": used} if used else {}),
-        **({"extensionsRequired": [_QUANTIZATION]} if style.quantized else {}),
+        **({"extensionsRequired": required} if required else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
@@ -321,7 +388,7 @@ def _document(
         ],
         "accessors": [accessor.as_dict(view) for view, accessor in enumerate(accessors)],
         "bufferViews": views,
-        "buffers": [{"byteLength": total + -total % 4}],
+        "buffers": [{"byteLength": total + -total % 4}, *[unpacked] * style.compressed],
     }
     if picture_bytes:
         base = {**_MATERIAL["pbrMetallicRoughness"], "baseColorTexture": {"index": 0}}

@@ -8,6 +8,7 @@ instead of a search without end.
 
 from __future__ import annotations
 
+import functools
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -105,13 +106,12 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     if near is None or bounds is None:
         raise _empty("no ray of the training views met a surface")
     known = known_depths(ctx.workspace, options.use_depth_maps)
-    crop, told_crop = chosen_crop(
-        options.crop, place, lambda: search_subject(scene, probes, known, ctx), ctx.logger
-    )
+    alone = options.extent == "subject"
+    search = functools.cache(lambda: search_subject(scene, probes, ctx, insist=alone))
+    crop, told_crop = chosen_crop(options.crop, place, search, ctx.logger)
     thing = subject = None
-    if crop is None and options.extent == "subject":
-        decision = search_subject(scene, probes, known, ctx, insist=True)
-        thing, subject = decision.thing, as_dict(decision)
+    if crop is None and alone:
+        thing, subject = search().thing, as_dict(search())
         if thing is None:
             ctx.logger.warning("No subject was found; the cloud is what lies within max_distance.")
         else:
@@ -205,7 +205,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=6,
+    version=7,
     reads=("depth",),
     run=run,
     options=PointcloudOptions,

@@ -33,3 +33,18 @@ class Sight:
         hidden = self._scene.test_occlusions(_core.Tensor(rays.astype(np.float32)), 0.0, 0.999)
         free: NDArray[np.bool_] = ~hidden.numpy()
         return free
+
+    def met(
+        self, eye: Floats, ways: Floats
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+        """What rays from an eye [3] along unit directions [N, 3] meet first.
+
+        Returns distances [N], infinite where there is nothing, faces [N], there 0, and where in
+        the face as barycentric coordinates [N, 3].
+        """
+        rays = np.concatenate([np.broadcast_to(eye, ways.shape), ways], axis=1)
+        found = self._scene.cast_rays(_core.Tensor(rays.astype(np.float32)))
+        distance = found["t_hit"].numpy()
+        face = np.where(np.isfinite(distance), found["primitive_ids"].numpy(), 0).astype(np.int64)
+        u, v = found["primitive_uvs"].numpy().T
+        return distance, face, np.stack([1.0 - u - v, u, v], axis=1)

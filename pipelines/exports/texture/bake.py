@@ -1,12 +1,14 @@
 """A mesh with a picture on it, out of the photos of the capture.
 
 Vertex colours cannot be finer than triangles are; photos are. Each face takes its colours from one
-photo, which keeps them sharp; brightness is levelled across the seams. Faces that no photo shows
+photo, which keeps them sharp; brightness is levelled across the seams, and in the end all photos
+that see a place have a say (`pipelines.exports.texture.refining`). Faces that no photo shows
 keep their vertices' colours. Memory: one photo at a time and the picture itself.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -20,7 +22,8 @@ from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos
 from pipelines.exports.texture.field import pixels_on, seen_from, texture_from_field
 from pipelines.exports.texture.levelling import levels
 from pipelines.exports.texture.photos import Photos, colors_at, softened
-from pipelines.exports.texture.texels import spread, texels_of
+from pipelines.exports.texture.refining import refine
+from pipelines.exports.texture.texels import ROWS, spread, texels_of
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
@@ -28,7 +31,10 @@ from pipelines.stage import StageContext
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-_CHOICE_SHARE, _CUT_SHARE, _COPY_SHARE = 0.55, 0.65, 0.85
+_CHOICE_SHARE, _CUT_SHARE, _COPY_SHARE = 0.35, 0.4, 0.5
+_LEVEL_SHARE, _ADD_SHARE = 0.52, 0.55
+_MOST_POLLS = 1000
+"""Of what solves for the corners' levels, about."""
 _LOOK_SHARE = 0.1
 _SPREAD_PX = 3
 
@@ -70,7 +76,9 @@ def painted(
                 options.texture_px,
                 lambda done: on_progress(_LOOK_SHARE + (1.0 - _LOOK_SHARE) * done),
             )
-        return texture_from_photos(mesh, photos, options.texture_px, on_progress)
+        return texture_from_photos(
+            mesh, photos, options.texture_px, on_progress, options.refine_texture
+        )
     except TextureFull as error:
         ctx.logger.warning(
             "The mesh keeps the colours of its vertices: %s. Raise texture_px, or lower max_faces.",
@@ -84,9 +92,11 @@ def texture_from_photos(
     photos: Photos,
     largest_side: int,
     on_progress: Callable[[float], None] = lambda done: None,
+    refined: bool = True,
 ) -> TexturedMesh:
     """Paint a mesh of the world. largest_side: of the texture, px, a power of two.
 
+    refined: whether all photos that see a place have a say in its colour, or one of them alone.
     on_progress: told the share that is done; may raise. Raises TextureFull.
     """
     vertices = photos.frame.scene_from_world(mesh.vertices)
@@ -109,9 +119,16 @@ def texture_from_photos(
         ground,
         lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
     )
-    added = levels(charts, colors, lambda: on_progress(_COPY_SHARE))
+    added = levels(charts, colors, _moving(on_progress, _COPY_SHARE, _LEVEL_SHARE, _MOST_POLLS))
     own = mesh.colors[charts.vertex]
-    _level(picture, charts, layout, added, lambda: on_progress(_COPY_SHARE))
+    calls = layout.side // ROWS + 4 * _SPREAD_PX
+    told = _moving(on_progress, _LEVEL_SHARE, _ADD_SHARE, calls)
+    covered = _level(picture, charts, layout, added, told)
+    if refined:
+        refine(
+            *(picture, covered, surface, charts, layout, photos),
+            lambda done: on_progress(_ADD_SHARE + (1.0 - _ADD_SHARE) * done),
+        )
     _fill_cells(picture, charts, layout, own)
     on_progress(1.0)
     return TexturedMesh(
@@ -121,6 +138,14 @@ def texture_from_photos(
         uv=layout.uv / layout.side,
         texture=picture,
     )
+
+
+def _moving(
+    on_progress: Callable[[float], None], begin: float, end: float, calls: int
+) -> Callable[[], None]:
+    """What tells progress from begin to end, a step further each time it is called."""
+    made = itertools.count(1)
+    return lambda: on_progress(begin + (end - begin) * min(next(made) / (calls + 1), 1.0))
 
 
 def _copied(
@@ -160,23 +185,27 @@ def _copied(
 
 def _level(
     picture: Bytes, charts: Charts, layout: Layout, added: Floats, on_rows: Callable[[], None]
-) -> None:
-    """Add what each corner needs, and between corners what lies between, in place."""
+) -> NDArray[np.bool_]:
+    """Add what each corner needs, and between corners what lies between, in place.
+
+    Returns which texels are on faces that a photo shows, [side, side].
+    """
     shown = charts.photo[charts.face_chart] != NOBODY
+    covered = np.zeros(picture.shape[:2], np.bool_)
     if not shown.any():
-        return
+        return covered
     faces = charts.faces[shown]
     steps = np.zeros(picture.shape, np.int16)
-    covered = np.zeros(picture.shape[:2], np.bool_)
     for texels in texels_of(layout.uv, faces, layout.side):
         values = np.einsum("nc,ncd->nd", texels.weights, added[faces[texels.face]])
         values = np.rint(255.0 * values)
         steps[texels.rows][texels.covered] = np.clip(values, -255, 255).astype(np.int16)
         covered[texels.rows] = texels.covered
         on_rows()
-    spread(steps, covered, _SPREAD_PX, on_rows)
+    spread(steps, covered.copy(), _SPREAD_PX, on_rows)
     np.clip(picture + steps, 0, 255, out=steps)
     picture[:] = steps.astype(np.uint8)
+    return covered
 
 
 def _fill_cells(picture: Bytes, charts: Charts, layout: Layout, colors: Floats) -> None:

@@ -23,7 +23,7 @@ Ints = NDArray[np.int32]
 
 NOBODY = -1
 _CANDIDATES = 6
-_LEAST_COSINE = 0.15
+LEAST_COSINE = 0.15
 _UNLIKE = 0.15
 """Difference of a colour channel to the median of the candidates, beyond which one is not one."""
 _ROUNDS = 12
@@ -67,6 +67,7 @@ class Surface:
         self.centers: Floats = corners.mean(axis=1)
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         twice = np.linalg.norm(across, axis=1)
+        self.twice_area: Floats = twice
         self.face_normals: Floats = across / np.maximum(twice, 1e-30)[:, None]
         lift = 0.5 * np.sqrt(0.5 * twice)
         self._lifted_centers = self.centers + lift[:, None] * self.face_normals
@@ -82,6 +83,12 @@ class Surface:
         whole: NDArray[np.bool_] = np.all(seen[self.faces[faces]], axis=1)
         whole[whole] = self._sight.reached(eye, self._lifted_centers[faces[whole]])
         return whole
+
+    def met(
+        self, eye: NDArray[np.float32], ways: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+        """What rays meet, as `Sight.met`."""
+        return self._sight.met(eye, ways)
 
 
 def choose_photos(
@@ -101,7 +108,7 @@ def _look(surface: Surface, photos: Photos, index: int, candidates: _Candidates)
     eye = photos.eye(index)
     toward = eye - surface.centers
     distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-30)
-    facing = (toward * surface.face_normals).sum(axis=1) > _LEAST_COSINE * distance
+    facing = (toward * surface.face_normals).sum(axis=1) > LEAST_COSINE * distance
     pixels, inside = photos.pixels(index, surface.vertices)
     faces = np.flatnonzero(facing & inside[surface.faces].all(axis=1))
     faces = faces[surface.unhindered(eye, faces)]

@@ -6,16 +6,19 @@ those of the stored photo, lens distortion and all; the centre of the top-left o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
 from pipelines.nerf.data.light import light_table
 from pipelines.nerf.space.cameras import SceneTransform
+from pipelines.nerf.space.lenses import EQUIRECTANGULAR
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.picture_sampling import between_pixels, points_in_frame
 from pipelines.scene.trained_scene import nerf_cameras
@@ -67,11 +70,29 @@ class Photos:
         with Image.open(self._root / self._images[index].file) as opened:
             return self._levelled(index, opened.convert("RGB"))
 
+    def rays(self, index: int, pixels: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where the camera is [3], and unit directions [P, 3] through pixels [P, 2]."""
+        which = torch.full((len(pixels),), index)
+        rays = self._cameras.generate_rays(which, torch.as_tensor(pixels, dtype=torch.float32))
+        return self.eye(index).astype(np.float32), rays.directions.numpy()
+
+    def pixel_angle(self, index: int) -> float:
+        """Between the rays of neighbouring pixels, radians."""
+        angle = 1.0 / float(self._cameras.focal[index].mean())
+        # An equirectangular plane is in half turns, not in radians.
+        whole = int(self._cameras.model[index]) == EQUIRECTANGULAR
+        return angle * math.pi if whole else angle
+
+    def glance_size(self, index: int) -> tuple[int, int]:
+        """Width and height of what `glance` gives."""
+        width, height = self.size(index)
+        shrink = min(1.0, _GLANCE_SIDE / max(width, height))
+        return max(1, round(width * shrink)), max(1, round(height * shrink))
+
     def glance(self, index: int) -> tuple[Image.Image, NDArray[np.float64]]:
         """The photo, RGB, at most 640 px long, and its size as a share [2] of the whole one's."""
         width, height = self.size(index)
-        shrink = min(1.0, _GLANCE_SIDE / max(width, height))
-        small = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        small = self.glance_size(index)
         with Image.open(self._root / self._images[index].file) as opened:
             opened.draft("RGB", small)
             glance = opened.convert("RGB").resize(small, Image.Resampling.BOX)

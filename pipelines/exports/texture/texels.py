@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_ROWS = 256
+ROWS = 256
 """Looked up at a time: of a picture of 8192 px, two million texels of some sixty bytes."""
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
@@ -40,7 +40,7 @@ class Texels:
 
 
 def texels_of(
-    uv: Floats, faces: NDArray[np.integer[Any]], side: int, rows: int = _ROWS
+    uv: Floats, faces: NDArray[np.integer[Any]], side: int, rows: int = ROWS
 ) -> Iterator[Texels]:
     """The texels that faces cover, some rows at a time, until below the last face.
 

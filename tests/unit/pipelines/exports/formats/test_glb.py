@@ -226,6 +226,46 @@ def test_quantized_files_show_the_same_in_half_the_bytes_a_vertex(
 
 
 @pytest.mark.parametrize("kind", ["file", "textured"])
+def test_compressed_files_hold_what_quantized_ones_do_in_fewer_bytes(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    plain = read_mesh(request.getfixturevalue(kind))
+    rows = np.repeat(np.arange(len(plain.vertices)), 40)  # long enough for there to be a gain
+    long = dataclasses.replace(
+        plain,
+        vertices=plain.vertices[rows] + np.linspace(0.0, 1.0, len(rows))[:, None],
+        normals=plain.normals[rows],
+        faces=np.arange(len(rows) // 3 * 3, dtype=np.int32).reshape(-1, 3),
+        **{key: getattr(plain, key)[rows] for key in ("uv", "colors") if hasattr(plain, key)},
+    )
+    quantized, compressed = tmp_path / "quantized.glb", tmp_path / "compressed.glb"
+    write_mesh(quantized, long, style=GlbStyle(quantized=True))
+    write_mesh(compressed, long, style=GlbStyle(compressed=True))
+    assert problems_of(compressed) == []
+    wanted, found = read_mesh(quantized), read_mesh(compressed)
+    assert type(found) is type(wanted)
+    for key in (
+        "vertices",
+        "faces",
+        "normals",
+        *(("uv",) if hasattr(plain, "uv") else ("colors",)),
+    ):
+        np.testing.assert_array_equal(getattr(found, key), getattr(wanted, key))
+    assert compressed.stat().st_size < quantized.stat().st_size
+    data = compressed.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert document["extensionsRequired"] == ["KHR_mesh_quantization", "EXT_meshopt_compression"]
+    first, second = document["buffers"]
+    assert "uri" not in first
+    assert second["extensions"]["EXT_meshopt_compression"] == {"fallback": True}
+    for view in document["bufferViews"][:4]:
+        stored = view["extensions"]["EXT_meshopt_compression"]
+        assert view["buffer"] == 1
+        assert stored["count"] * stored["byteStride"] == view["byteLength"]
+        assert stored["byteOffset"] % 4 == 0
+
+
+@pytest.mark.parametrize("kind", ["file", "textured"])
 def test_a_lit_file_leaves_light_to_the_viewer(
     kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

@@ -13,11 +13,11 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from pipelines.errors import Cancelled, ExportError
+from pipelines.exports import mesh_shape
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.surface import poisson_solver, tsdf
-from pipelines.exports.surface import watertight as watertight_module
 from pipelines.exports.surface.borders import border_loops
 from pipelines.exports.texture import charts
 from pipelines.judging.asset_views import Texture
@@ -349,7 +349,7 @@ def test_a_subject_to_be_printed_is_watertight_and_others_are_told_not_to_be(
     assert "not watertight" not in caplog.text
     monkey = pytest.MonkeyPatch()
     with monkey.context() as patch:
-        patch.setattr(watertight_module, "made_watertight", lambda mesh, *others: mesh)
+        patch.setattr(mesh_shape, "made_watertight", lambda mesh, *others: mesh)
         found = tiny_job.run(job, "mesh", watertight=True, **wanted)["summary"]
     assert found["watertight"] is False
     assert "The mesh is not watertight" in caplog.text

@@ -112,8 +112,7 @@ def test_a_subject_asked_for_is_what_a_mesh_is_cropped_to(job: Workspace) -> Non
     inside = box.contains(before.astype(np.float64)).sum()
     assert inside < 0.9 * len(before)
     assert len(points) > 1.2 * inside, "the points that are wanted are looked for in the thing"
-    # A mesh that is cropped to what was found has looked for it in the same way. (With
-    # extent=subject it looks at itself when it is finished: of so few steps that may be another.)
+    # A mesh that is cropped to what was found has looked for it in the same way.
     crop = tiny_job.run(job, "mesh", crop={"shape": "auto"}, texture="none")["summary"]["crop"]
     other = crop_of(CropShapeOptions(**crop["used"]))
     assert other is not None

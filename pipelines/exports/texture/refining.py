@@ -1,0 +1,303 @@
+"""A texture brought nearer to what all photos show of it, not only the one that it was copied from.
+
+A photo is not quite where its pose says and the surface not quite where it was found; a glossy
+place looks otherwise from elsewhere. So a patch that is exact in its own photo is off in the
+others, by more than what they have in common is. Here a *step* is added to the texture, which
+lessens
+
+    sum over pixels p of the photos   w_p | photo_p - (A (texture + step))_p |^2
+
+A asks a copy of the texture, as fine as the pixel, between its texels, as viewers do, and is
+linear. The step has texels of twice the size: what is finer stays as the sharpest photo has it.
+Pixels far from what the others agree on, as a passer-by's, count less (Huber, "Robust estimation of
+a location parameter", 1964). Solved by a few rounds of SIRT (Gilbert 1972): each texel moves by the
+mean of what the pixels that see it miss, which from a good beginning needs few.
+
+Left out are pixels at jumps of depth and at holes, where a pose that is off shows something else,
+masked ones, what is seen from behind or at a glance, and faces that no photo shows whole.
+
+Symbols: N pixels, S side of the texture, M texels of all the copies, one row after another.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from pipelines.exports.texture.charts import MARGIN_PX, Charts, Layout
+from pipelines.exports.texture.choice import LEAST_COSINE, NOBODY, Surface
+from pipelines.exports.texture.photos import Photos
+from pipelines.exports.texture.texels import spread
+
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+_ROUNDS = 3
+_FAR_OFF = 0.06
+"""A pixel that is farther off, root mean square of its channels, counts as if it were so far."""
+_KEEP = 0.05
+"""Pixels' worth of what was there before: a texel that hardly anything sees stays."""
+_JUMP = 0.03
+"""Neighbouring pixels whose distances differ by a larger share see two surfaces."""
+_COPIES = 3
+"""Copies of the texture, of a half, a quarter and an eighth of its side."""
+_LEAST_SIDE = 1 << (_COPIES + 1)
+_PIXELS = 16_000_000
+"""Looked at in all, at some 40 bytes each; of more an even choice."""
+_CHUNK = 2_000_000
+_SPREAD_PASSES = 2
+_ROWS = 256
+_LOOK_SHARE, _MARGIN_SHARE, _SOLVE_SHARE, _SPREAD_SHARE = 0.5, 0.55, 0.95, 0.99
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """Some pixels of the photos. seen: [N, M], texels as each pixel mixes them. color: [N, 3]."""
+
+    seen: csr_array
+    color: Bytes
+
+
+def refine(
+    picture: Bytes,
+    covered: NDArray[np.bool_],
+    surface: Surface,
+    charts: Charts,
+    layout: Layout,
+    photos: Photos,
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> None:
+    """Move a texture [S, S, 3] towards what the photos show, in place.
+
+    covered: [S, S], texels on faces that a photo shows; changed. surface: whose faces are those of
+    the charts, in order. on_progress: told the share that is done; may raise.
+    """
+    if layout.side < _LEAST_SIDE or not (charts.photo != NOBODY).any():
+        return
+    looks = _looks(surface, charts, layout, photos, lambda done: on_progress(_LOOK_SHARE * done))
+    if not looks:
+        return
+    # What a patch shows around its faces may lie behind them: at a pixel that mixes both, the face
+    # would make up for it.
+    told = _moving(on_progress, _LOOK_SHARE, _MARGIN_SHARE, 4 * MARGIN_PX)
+    spread(picture, covered, MARGIN_PX, told)
+    half = layout.side // 2
+    begun = np.empty((half, half, 3), np.float32)
+    for top in range(0, half, _ROWS):
+        rows = picture[2 * top : 2 * min(top + _ROWS, half)].astype(np.float32)
+        begun[top : top + _ROWS] = _halved(rows) / np.float32(255.0)
+    step, known = solved(
+        begun,
+        [(look.seen, look.color) for look in looks],
+        lambda done: on_progress(_MARGIN_SHARE + (_SOLVE_SHARE - _MARGIN_SHARE) * done),
+    )
+    del looks, begun
+    told = _moving(on_progress, _SOLVE_SHARE, _SPREAD_SHARE, 4 * _SPREAD_PASSES)
+    spread(step, known, _SPREAD_PASSES, told)
+    _add(picture, step, _last_row(charts, layout))
+
+
+def _moving(
+    on_progress: Callable[[float], None], begin: float, end: float, calls: int
+) -> Callable[[], None]:
+    """What tells progress from begin to end, a step further each time it is called."""
+    made = itertools.count(1)
+    return lambda: on_progress(begin + (end - begin) * min(next(made) / calls, 1.0))
+
+
+def solved(
+    begun: Floats,
+    looks: list[tuple[csr_array, Bytes]],
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """What to add to a texture [T, T, 3] in [0, 1], and where that is known, [T, T].
+
+    looks: pixels in several parts, each a matrix [N, M] with rows that sum to 1, and colours
+    [N, 3]; M texels of the texture and its copies, as `copies_of` has them.
+    """
+    side = len(begun)
+    texture = begun.copy()
+    known = np.zeros((side, side), np.bool_)
+    for turn in range(_ROUNDS):
+        texels = copies_of(texture)
+        missed = np.zeros((len(texels), 4), np.float32)
+        for done, (seen, color) in enumerate(looks):
+            off = color.astype(np.float32) / np.float32(255.0) - seen @ texels
+            size = np.sqrt(np.square(off).mean(axis=1))
+            weight = np.float32(_FAR_OFF) / np.maximum(size, np.float32(_FAR_OFF))
+            missed += seen.T @ np.column_stack([weight[:, None] * off, weight])
+            on_progress((turn + (done + 1) / len(looks)) / _ROUNDS)
+        mean = _gathered(missed, side)
+        held = mean[..., :3] + np.float32(_KEEP) * (begun - texture)
+        texture += held / (mean[..., 3:] + np.float32(_KEEP))
+        known |= mean[..., 3] > 0.0
+    return texture - begun, known
+
+
+def copies_of(texture: Floats) -> Floats:
+    """Texels of a texture [T, T, 3] and of its smaller copies, [M, 3], as viewers make these."""
+    levels = [texture]
+    while len(levels) < _COPIES:
+        levels.append(_halved(levels[-1]))
+    return np.concatenate([level.reshape(-1, 3) for level in levels])
+
+
+def mixing(places: NDArray[np.float64], level: NDArray[np.integer], side: int) -> csr_array:
+    """Pixels as mixtures of four texels each, [N, M].
+
+    places: [N, 2], in texels of the finest of the copies, of side [side]. level: [N], from 0, the
+    copy that each pixel asks.
+    """
+    sides = side >> level
+    at = np.clip(places / (1 << level)[:, None] - 0.5, 0.0, (sides - 1.0)[:, None])
+    first = np.minimum(at.astype(np.int64), (sides - 2)[:, None])
+    right, down = (at - first).T.astype(np.float32)
+    begins = np.concatenate([[0], np.cumsum([(side >> k) ** 2 for k in range(_COPIES)])])
+    corner = begins[level] + first[:, 1] * sides + first[:, 0]
+    columns = np.stack([corner, corner + 1, corner + sides, corner + sides + 1], axis=1)
+    left, up = np.float32(1.0) - right, np.float32(1.0) - down
+    values = np.stack([left * up, right * up, left * down, right * down], axis=1)
+    return csr_array(
+        (
+            values.reshape(-1),
+            columns.astype(np.int32).reshape(-1),
+            np.arange(0, 4 * len(places) + 1, 4, dtype=np.int32),
+        ),
+        shape=(len(places), int(begins[-1])),
+    )
+
+
+def _looks(
+    surface: Surface,
+    charts: Charts,
+    layout: Layout,
+    photos: Photos,
+    on_progress: Callable[[float], None],
+) -> list[_Looks]:
+    """What the photos see of the texture, some photos at a time."""
+    density = _density(surface, charts, layout)
+    painted = charts.photo[charts.face_chart] != NOBODY
+    sizes = [photos.glance_size(index) for index in range(len(photos))]
+    stride = max(1, -(-sum(width * height for width, height in sizes) // _PIXELS))
+    looks: list[_Looks] = []
+    waiting: list[tuple[NDArray[np.float64], NDArray[np.int64], Bytes]] = []
+    for index in range(len(photos)):
+        glance, share = photos.glance(index)
+        width, height = glance.size
+        kept, distance, face, weights = _met(surface, photos, index, (width, height), share)
+        chosen = np.zeros(len(kept), np.bool_)
+        chosen[index % stride :: stride] = True
+        kept &= chosen
+        kept[kept] = painted[face[kept]]
+        if kept.any():
+            rows, columns = np.divmod(np.flatnonzero(kept), width)
+            pixels = (np.stack([columns, rows], axis=1) + 0.5) / share
+            mask = photos.usable(index, pixels)
+            kept[kept] = mask
+            face, distance = face[kept], distance[kept]
+            corners = layout.uv[charts.faces[face]]
+            places = np.einsum("nc,ncd->nd", weights[kept], corners)
+            angle = photos.pixel_angle(index) / share.mean()
+            texels = np.maximum(density[face] * distance * angle, 1.0)
+            level = np.clip(np.rint(np.log2(texels)).astype(np.int64), 1, _COPIES) - 1
+            color = np.asarray(glance).reshape(-1, 3)[kept]
+            waiting.append((0.5 * places, level, color))
+        last = index + 1 == len(photos)
+        if waiting and (last or sum(len(level) for _, level, _ in waiting) >= _CHUNK):
+            places, level, color = (np.concatenate(part) for part in zip(*waiting, strict=True))
+            looks.append(_Looks(mixing(places, level, layout.side // 2), color))
+            waiting = []
+        on_progress((index + 1) / len(photos))
+    return looks
+
+
+def _met(
+    surface: Surface, photos: Photos, index: int, size: tuple[int, int], share: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], Floats, NDArray[np.int64], Floats]:
+    """Of all pixels of a photo of some size: whether it counts [N], distance [N], face [N], where
+    in the face [N, 3].
+
+    share: [2], of the whole photo's size.
+    """
+    width, height = size
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x.reshape(-1), y.reshape(-1)], axis=1) / share
+    eye, ways = photos.rays(index, pixels)
+    distance, face, weights = surface.met(eye, ways)
+    facing = -np.einsum("nd,nd->n", ways, surface.face_normals[face].astype(np.float32))
+    kept = np.isfinite(distance) & (facing > LEAST_COSINE)
+    kept &= _even(distance.reshape(height, width)).reshape(-1)
+    return kept, distance, face, weights
+
+
+def _even(distance: Floats) -> NDArray[np.bool_]:
+    """Where a pixel and its four neighbours see one surface, [H, W]."""
+    near = np.nan_to_num(distance, posinf=0.0)
+    even = near > 0.0
+    for axis in (0, 1):
+        one, two = (np.moveaxis(near, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        same = np.abs(one - two) <= _JUMP * np.minimum(one, two)
+        across = np.moveaxis(even, axis, 0)
+        across[:-1] &= same
+        across[1:] &= same
+    return even
+
+
+def _density(surface: Surface, charts: Charts, layout: Layout) -> Floats:
+    """Texels per unit of length on each face, [F]."""
+    a, b = (layout.uv[charts.faces[:, k]] - layout.uv[charts.faces[:, 0]] for k in (1, 2))
+    texels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    density: Floats = np.sqrt(texels / np.maximum(surface.twice_area, 1e-30)).astype(np.float32)
+    return density
+
+
+def _gathered(sums: Floats, side: int) -> Floats:
+    """Sums at the texels of all copies [M, 4], brought to the finest ones' [side, side, 4].
+
+    A texel of a copy is the mean of four, so each of these has a quarter of what it has.
+    """
+    begins = np.concatenate([[0], np.cumsum([(side >> k) ** 2 for k in range(_COPIES)])])
+    parts = [
+        sums[begins[k] : begins[k + 1]].reshape(side >> k, side >> k, 4) for k in range(_COPIES)
+    ]
+    total = parts[-1]
+    for part in reversed(parts[:-1]):
+        total = part + np.float32(0.25) * total.repeat(2, axis=0).repeat(2, axis=1)
+    return total
+
+
+def _halved(picture: Floats) -> Floats:
+    """[H, W, 3] with 2 x 2 texels as one."""
+    height, width = picture.shape[0] // 2, picture.shape[1] // 2
+    mean: Floats = picture.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    return mean
+
+
+def _last_row(charts: Charts, layout: Layout) -> int:
+    """Where the cells of faces without a photo begin: they keep their vertices' colours."""
+    alone = charts.photo[charts.chart] == NOBODY
+    return int(layout.uv[alone, 1].min()) if alone.any() else layout.side
+
+
+def _add(picture: Bytes, step: Floats, last_row: int) -> None:
+    """Add a step [S / 2, S / 2, 3], between its texels what lies between, above a row."""
+    for top in range(0, last_row, 2 * _ROWS):
+        bottom = min(top + 2 * _ROWS, last_row)
+        rows = np.arange(top, bottom)
+        between = _between(_between(step, rows, 0), np.arange(len(picture)), 1)
+        moved = picture[top:bottom] + np.float32(255.0) * between
+        picture[top:bottom] = np.rint(np.clip(moved, 0.0, 255.0)).astype(np.uint8)
+
+
+def _between(step: Floats, texels: NDArray[np.int64], axis: int) -> Floats:
+    """A step along one axis at texels of half the size: a quarter of the one beside."""
+    inner = texels // 2
+    beside = np.clip(inner + np.where(texels % 2 == 0, -1, 1), 0, step.shape[axis] - 1)
+    mixed = np.float32(0.75) * step.take(inner, axis) + np.float32(0.25) * step.take(beside, axis)
+    between: Floats = mixed
+    return between
