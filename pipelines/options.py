@@ -207,6 +207,10 @@ class DraftOptions(ExtentOptions, TextureOptions):
         description="photos puts a picture on the mesh, made of the photos; none leaves it its "
         "vertices' colours.",
     )
+    refine_texture: bool = Field(
+        False,
+        description="As mesh.refine_texture; off, as a draft is for a first look.",
+    )
     resolution: int = Field(
         160, ge=32, le=2048, description="Voxels along the longest side of the subject."
     )

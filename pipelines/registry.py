@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=10,
+        version=11,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",
@@ -95,12 +95,13 @@ STAGES: tuple[Stage, ...] = (
         run="pipelines.stages.depth:run",
         options="DepthOptions",
         explains=_EXPLAINS,
+        needs_gpu=True,
         time_limit_s=6 * 3600.0,
         artifacts=(Artifact("depth.jpg", "depth.jpg", "image/jpeg", "any picture viewer"),),
     ),
     Stage(
         name="draft",
-        version=5,
+        version=6,
         after=("depth",),
         reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.draft:run",

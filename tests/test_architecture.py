@@ -110,6 +110,7 @@ PIPELINE_ROOMS: tuple[tuple[str, ...], ...] = (
 NERF_ROOMS: tuple[tuple[str, ...], ...] = (
     ("errors",),
     ("plugins",),
+    ("devices",),
     ("options",),
     ("space",),
     ("along_ray",),

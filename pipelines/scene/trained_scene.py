@@ -18,13 +18,13 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.errors import ExportError, PipelineError
+from pipelines.nerf.devices import choose_device
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Appearance, Model
 from pipelines.nerf.options.render import RenderConfig
 from pipelines.nerf.renderer import RenderedImage, Renderer, seen_within
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.training.checkpoint import load_model
-from pipelines.nerf.training.state import choose_device
 from pipelines.scene.bounds import SceneBounds, bounds_of_views
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.scene.depth_views import DepthView, Pinhole, z_depth_of
@@ -120,6 +120,14 @@ class TrainedScene:
             model = loaded.model.to(choose_device("auto"))
         cameras = _cameras_of(loaded.extras)
         return cls(model, loaded.scene, cameras, loaded.extras, render_config, memory_share)
+
+    def by_default(self) -> TrainedScene:
+        """The same, rendered with the default options: for what is not to depend on those."""
+        if self._render_config == RenderConfig():
+            return self
+        return TrainedScene(
+            self.model, self.scene, self.cameras, self.extras, None, self._memory_share
+        )
 
     @property
     def bend(self) -> float | None:

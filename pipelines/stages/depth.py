@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +28,13 @@ from pipelines.nerf.data.light import Light
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, config_from_dict
+from pipelines.nerf.stereo.engines import Engine, TorchEngine, choose_engine
 from pipelines.nerf.stereo.light import find_light
-from pipelines.nerf.stereo.maps import DepthMap, Progress, find_depth_maps, surface_points
+from pipelines.nerf.stereo.maps import MapShelf, Progress, find_depth_maps, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.planes import completed
-from pipelines.nerf.stereo.sensor import merged, sensor_maps, sensor_scale
+from pipelines.nerf.stereo.sensor import merged_maps, sensor_maps, sensor_scale
+from pipelines.nerf.stereo.shelves import Shelf
 from pipelines.nerf.stereo.standing import stood_up
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.option_models import StageOptions
@@ -41,6 +45,7 @@ from pipelines.scene.natural_order import natural_key
 from pipelines.scene.stereo_views import sensor_depth, stereo_view, undistorted_picture
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
+from pipelines.stages.depth_checkpoint import DepthCheckpoint, inputs_of
 
 _LOAD_SHARE, _STEREO_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.72, 0.1, 0.1
 _LIGHT_SHARE = 0.03
@@ -58,7 +63,6 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     if source == "off":
         writer.close()
         return {"source": source, "num_maps": 0}
-    started = time.monotonic()
     capture, images = training_images(ctx, split)
     with_sensor = source in ("auto", "sensor") and any(image.depth for image in images)
     if source == "sensor" and not with_sensor:
@@ -67,93 +71,162 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
             code="no_sensor_depth",
             hint="Set depth.source to auto or stereo.",
         )
-    views: list[StereoView] = []
-    sensed: list[NDArray[np.float32] | None] = []
-    for index, image in enumerate(images):
-        lens, root = capture.cameras[image.camera], ctx.workspace.images_root
-        views.append(stereo_view(root, image, lens, config.long_side_px))
-        sensed.append(sensor_depth(root, image, lens, _pinhole(views[-1])) if with_sensor else None)
-        ctx.progress(_LOAD_SHARE * (index + 1) / len(images), "loading images")
-
-    def on_progress(fraction: float, message: str) -> None:
-        share = _LOAD_SHARE + _STEREO_SHARE * fraction
-        spent = time.monotonic() - started
-        ctx.progress(share, message, spent * (1.0 - share) / share if share > 0.1 else None)
-
-    def on_completing(fraction: float, message: str) -> None:
-        ctx.progress(_LOAD_SHARE + _STEREO_SHARE + _PLANES_SHARE * fraction, message)
-
-    def on_standing(fraction: float, message: str) -> None:
-        begun = _LOAD_SHARE + _STEREO_SHARE + _PLANES_SHARE
-        ctx.progress(begun + _WALLS_SHARE * fraction, message)
-
-    summary: dict[str, Any] = {"source": "stereo", "num_maps": len(images)}
-    if with_sensor:
-        maps, told = _with_sensor(ctx, views, sensed, config, source, on_progress)
-        summary |= told
-    else:
-        maps = find_depth_maps(views, config, _known_points(ctx), on_progress)
-    if config.complete_planes:
-        summary["matched_share"] = round(_known_share(maps), 4)
-        maps = completed(views, maps, config, on_completing)
-    if config.standing_walls:
-        summary["before_walls_share"] = round(_known_share(maps), 4)
-        maps = stood_up(views, maps, config, on_standing)
-    lights, summary["light"] = _light(ctx, capture, images, views, maps, config)
-    for image, view, found, light in zip(images, views, maps, lights, strict=True):
+    search = _Search.prepared(ctx, capture, images, config, source if with_sensor else "stereo")
+    maps, told = search.all_passes()
+    lights, told["light"] = _light(search, maps)
+    for image, view, found, light in zip(images, search.views, maps, lights, strict=True):
         ctx.check_cancelled()
         writer.append(image.file, _pinhole(view), found, light)
     writer.close(measured=with_sensor)
-    _save_picture(ctx.out / "depth.jpg", views, maps)
-    summary |= _described(maps)
+    _save_picture(ctx.out / "depth.jpg", search.views, maps)
+    summary = {"num_maps": len(images), "device": search.device, **told, **_described(maps)}
     (ctx.out / "report.json").write_text(json.dumps(summary, indent=1), "utf-8")
+    search.checkpoint.close()
     return summary
 
 
-def _with_sensor(
-    ctx: StageContext,
-    views: list[StereoView],
-    sensed: list[NDArray[np.float32] | None],
-    config: StereoConfig,
-    source: str,
-    on_progress: Progress,
-) -> tuple[list[DepthMap], dict[str, Any]]:
-    """Maps from the sensor, and from stereo too unless it is all that is wanted; and what of it."""
-    told: dict[str, Any] = {
-        "source": "sensor",
-        "num_sensor_maps": sum(z is not None for z in sensed),
-    }
-    if source == "sensor":
-        return sensor_maps(views, sensed, config), told
-    points = _known_points(ctx)
-    points = surface_points(views, sensed) if points is None else points
-    stereo = find_depth_maps(views, config, points, on_progress)
-    scale = sensor_scale(stereo, sensed)
-    if scale.factor != 1.0:
-        ctx.logger.warning(
-            "The sensor's depths are multiplied by %.4g to fit the camera poses", scale.factor
+Found = tuple[MapShelf, dict[str, Any]]
+"""A pass's maps, and what is told of it."""
+
+
+@dataclass
+class _Search:
+    """The passes over a capture's views, each complete in the checkpoint before the next begins.
+
+    source: "stereo", or with a sensor "auto" or "sensor". patches: of the pictures, where they were
+    looked for.
+    """
+
+    ctx: StageContext
+    capture: CamerasFile
+    images: list[PosedImage]
+    views: list[StereoView]
+    config: StereoConfig
+    source: str
+    engine: Engine
+    checkpoint: DepthCheckpoint
+    patches: Shelf
+    started: float
+
+    @classmethod
+    def prepared(
+        cls,
+        ctx: StageContext,
+        capture: CamerasFile,
+        images: list[PosedImage],
+        config: StereoConfig,
+        source: str,
+    ) -> _Search:
+        """Load the images, and what an attempt before has found."""
+        started = time.monotonic()
+        views: list[StereoView] = []
+        for index, image in enumerate(images):
+            lens, root = capture.cameras[image.camera], ctx.workspace.images_root
+            views.append(stereo_view(root, image, lens, config.long_side_px))
+            ctx.progress(_LOAD_SHARE * (index + 1) / len(images), "loading images")
+        with nerf_errors_as(TrainingError):
+            engine = choose_engine(views, config)
+        files = [image.file for image in images]
+        told = [inputs_of(ctx), files, asdict(config), source, _device(engine)]
+        checkpoint = DepthCheckpoint(ctx, len(views), told)
+        patches = checkpoint.shelves.scratch("patches", len(views))
+        return cls(
+            ctx, capture, images, views, config, source, engine, checkpoint, patches, started
         )
-        sensed = [None if z is None else z * np.float32(scale.factor) for z in sensed]
-    told |= {
-        "source": "stereo and sensor",
-        "sensor_scale": round(scale.factor, 6),
-        "sensor_scale_spread": None if scale.spread is None else round(scale.spread, 5),
-    }
-    measured = sensor_maps(views, sensed, config)
-    both = zip(stereo, measured, strict=True)
-    return [merged(a, b) for a, b in both], told
+
+    @property
+    def device(self) -> str:
+        """Who computes, as it is told."""
+        return _device(self.engine)
+
+    def all_passes(self) -> Found:
+        """Maps of all images, and what is told of them."""
+        passes: list[tuple[str, Callable[[], Found]]] = [("matched", self._matched)]
+        if self.config.complete_planes:
+            passes.append(("planes", self._completed))
+        if self.config.standing_walls:
+            passes.append(("walls", self._stood_up))
+        for name, work in passes:
+            if name not in self.checkpoint.passes:
+                self.checkpoint.complete(name, *work())
+        return self.checkpoint.maps(), self.checkpoint.told
+
+    def _progress(self, begun: float, share: float) -> Progress:
+        """Of a part of the stage. What is found so far is offered, before a cancel ends it."""
+
+        def report(fraction: float, message: str) -> None:
+            self.checkpoint.offer()
+            done = begun + share * fraction
+            spent = time.monotonic() - self.started
+            stereo = begun < _LOAD_SHARE + _STEREO_SHARE
+            eta_s = spent * (1.0 - done) / done if done > 0.1 and stereo else None
+            self.ctx.progress(done, message, eta_s)
+
+        return report
+
+    def _matched(self) -> Found:
+        on_progress = self._progress(_LOAD_SHARE, _STEREO_SHARE)
+        points, shelves = _known_points(self.ctx), self.checkpoint.shelves
+        if self.source == "stereo":
+            with_points = self.views, self.config, points, on_progress
+            return find_depth_maps(*with_points, self.engine, shelves), {"source": "stereo"}
+        sensed = self._sensed()
+        told: dict[str, Any] = {
+            "source": "sensor",
+            "num_sensor_maps": sum(z is not None for z in sensed),
+        }
+        if self.source == "sensor":
+            return sensor_maps(self.views, sensed, self.config, self.engine, shelves), told
+        points = surface_points(self.views, sensed) if points is None else points
+        with_points = self.views, self.config, points, on_progress
+        stereo = find_depth_maps(*with_points, self.engine, shelves)
+        scale = sensor_scale(stereo, sensed)
+        if scale.factor != 1.0:
+            self.ctx.logger.warning(
+                "The sensor's depths are multiplied by %.4g to fit the camera poses", scale.factor
+            )
+            sensed = [None if z is None else z * np.float32(scale.factor) for z in sensed]
+        told |= {
+            "source": "stereo and sensor",
+            "sensor_scale": round(scale.factor, 6),
+            "sensor_scale_spread": None if scale.spread is None else round(scale.spread, 5),
+        }
+        measured = sensor_maps(self.views, sensed, self.config, self.engine, shelves)
+        return merged_maps(stereo, measured, shelves), told
+
+    def _sensed(self) -> list[NDArray[np.float32] | None]:
+        """What the capture's sensor saw, as the views have it; None for an image without depth."""
+        root, found = self.ctx.workspace.images_root, []
+        for image, view in zip(self.images, self.views, strict=True):
+            self.ctx.check_cancelled()
+            lens = self.capture.cameras[image.camera]
+            found.append(sensor_depth(root, image, lens, _pinhole(view)))
+        return found
+
+    def _completed(self) -> Found:
+        maps = self.checkpoint.maps()
+        told = {"matched_share": round(_known_share(maps), 4)}
+        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _PLANES_SHARE)
+        given = self.views, maps, self.config, on_progress, self.engine
+        return completed(*given, self.checkpoint.shelves, self.patches), told
+
+    def _stood_up(self) -> Found:
+        maps = self.checkpoint.maps()
+        told = {"before_walls_share": round(_known_share(maps), 4)}
+        begun = _LOAD_SHARE + _STEREO_SHARE + _PLANES_SHARE
+        on_progress = self._progress(begun, _WALLS_SHARE)
+        given = self.views, maps, self.config, on_progress, self.engine
+        return stood_up(*given, self.checkpoint.shelves, self.patches), told
 
 
-def _light(
-    ctx: StageContext,
-    capture: CamerasFile,
-    images: list[PosedImage],
-    views: list[StereoView],
-    maps: list[DepthMap],
-    config: StereoConfig,
-) -> tuple[list[Light | None], dict[str, Any] | None]:
+def _device(engine: Engine) -> str:
+    return engine.device.type if isinstance(engine, TorchEngine) else "cpu"
+
+
+def _light(search: _Search, maps: MapShelf) -> tuple[list[Light | None], dict[str, Any] | None]:
     """The light of each picture, None of each where they stay as they are; and what was found."""
-    nothing: list[Light | None] = [None] * len(images)
+    ctx, views, config = search.ctx, search.views, search.config
+    nothing: list[Light | None] = [None] * len(views)
     if config.level_light == "off":
         return nothing, None
 
@@ -161,18 +234,17 @@ def _light(
         done = 1.0 - _LIGHT_SHARE * (1.0 - share)
         ctx.progress(done, "comparing the pictures' light")
 
-    depths = [found.z for found in maps]
-    points = surface_points(views, depths)
+    points = surface_points(views, maps.z)
     if len(points) == 0:
         return nothing, None
-    pictures = []
-    for index, (image, view) in enumerate(zip(images, views, strict=True)):
-        on_progress(0.5 * index / len(images))
-        lens, root = capture.cameras[image.camera], ctx.workspace.images_root
-        pictures.append(undistorted_picture(root, image, lens, _pinhole(view)))
+    pictures = search.checkpoint.shelves.scratch("colours", len(views))
+    for index, (image, view) in enumerate(zip(search.images, views, strict=True)):
+        on_progress(0.5 * index / len(views))
+        lens, root = search.capture.cameras[image.camera], ctx.workspace.images_root
+        pictures[index] = undistorted_picture(root, image, lens, _pinhole(view))
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
     light = find_light(
-        views, depths, pictures, neighbours, lambda share: on_progress(0.5 + 0.5 * share)
+        views, maps.z, pictures, neighbours, lambda share: on_progress(0.5 + 0.5 * share)
     )
     level = config.level_light == "on" or light.is_drifting
     told = {
@@ -185,7 +257,7 @@ def _light(
     }
     if level:
         ctx.logger.info("the pictures are brought to one light: %s", told)
-    return [light.of(index) for index in range(len(images))] if level else nothing, told
+    return [light.of(index) for index in range(len(views))] if level else nothing, told
 
 
 def training_images(ctx: StageContext, split: SplitConfig) -> tuple[CamerasFile, list[PosedImage]]:
@@ -209,11 +281,11 @@ def _pinhole(view: StereoView) -> Pinhole:
     return Pinhole(width, height, *view.lens)
 
 
-def _known_share(maps: list[DepthMap]) -> float:
+def _known_share(maps: MapShelf) -> float:
     return float(np.mean([(found.z > 0).mean() for found in maps]))
 
 
-def _described(maps: list[DepthMap]) -> dict[str, Any]:
+def _described(maps: MapShelf) -> dict[str, Any]:
     """How much of the pictures has a depth, and how many neighbours agree with it."""
     shares = [float((found.z > 0).mean()) for found in maps]
     votes = [float(found.votes[found.z > 0].mean()) for found in maps if (found.z > 0).any()]
@@ -224,7 +296,7 @@ def _described(maps: list[DepthMap]) -> dict[str, Any]:
     }
 
 
-def _save_picture(path: Path, views: list[StereoView], maps: list[DepthMap]) -> None:
+def _save_picture(path: Path, views: list[StereoView], maps: MapShelf) -> None:
     """Some of the pictures, their maps below: near is bright, far is dark, grey is unknown."""
     picked = evenly(len(views), _PICTURE_VIEWS)
     height = max(views[index].picture.shape[0] for index in picked)

@@ -24,6 +24,7 @@ from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.errors import TrainingError
 from pipelines.nerf.data.depth_maps import DepthMaps
 from pipelines.nerf.data.images import ImageData, load_images, split_indices
+from pipelines.nerf.devices import choose_device
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.options.train import TrainConfig
@@ -32,7 +33,7 @@ from pipelines.nerf.space.camera_optimizer import CameraOptimizer, se3_exp, so3_
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.training.checkpoint import load_checkpoint, save_model
 from pipelines.nerf.training.loop import TrainProgress, train
-from pipelines.nerf.training.state import choose_device, is_fast
+from pipelines.nerf.training.state import is_fast
 from pipelines.option_models import StageOptions
 from pipelines.options import resolve_options, stage_options, train_config
 from pipelines.scene.cameras_file import CamerasFile, PosedImage

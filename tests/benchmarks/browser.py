@@ -48,11 +48,12 @@ _GLB_PAGE = """<!doctype html><script type="importmap">
 </script><script type="module">
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { MeshoptDecoder } from 'three/addons/libs/meshopt_decoder.module.js';
 const tell = (answer) => fetch('/told', {method: 'POST', body: JSON.stringify(answer)});
 window.addEventListener('unhandledrejection', (event) => tell({error: String(event.reason)}));
 try {
   const begun = performance.now();
-  const gltf = await new GLTFLoader().loadAsync('/files/FILE');
+  const gltf = await new GLTFLoader().setMeshoptDecoder(MeshoptDecoder).loadAsync('/files/FILE');
   const loaded = performance.now() - begun;
   const side = 320, turns = TURNS;
   const renderer = new THREE.WebGLRenderer({antialias: true, preserveDrawingBuffer: true});

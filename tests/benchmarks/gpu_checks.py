@@ -2,8 +2,9 @@
 
 Each compiled kernel against its plain twin, values and gradients: the norm of the difference over
 the norm of what is expected. Then whole training steps, one kernel at a time and as CUDA graphs
-(`engines.gpu.self_check`). Inputs are random, of the paper's shapes. Works on any device where
-Triton's kernels run, the interpreter's CPU included.
+(`engines.gpu.self_check`), and dense stereo by PyTorch against the CPU's numba kernels. Inputs are
+random, of the paper's shapes. Works on any device where Triton's kernels run, the interpreter's CPU
+included.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pipelines.nerf.networks.fields import MLP
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
 from pipelines.nerf.options.parts import HashGridConfig
 from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.stereo.engines import KERNELS, TorchEngine, engine_gaps
 from tests.benchmarks.gpu_counts import mlp_widths
 from tests.benchmarks.tables import markdown_table
 
@@ -100,6 +102,15 @@ def kernel_checks(model: NerfactoConfig, num: int, device: torch.device) -> list
         except engine_errors() as error:
             checks.append(Check(name, float("nan"), 0.0, f"{type(error).__name__}: {error}"))
     return checks
+
+
+def stereo_checks(device: torch.device) -> list[Check]:
+    """Dense stereo on a device against the CPU's kernels: shares of pixels that differ."""
+    try:
+        gaps = engine_gaps(TorchEngine(device), KERNELS)
+    except engine_errors() as error:
+        return [Check("stereo", float("nan"), 0.0, f"{type(error).__name__}: {error}")]
+    return [Check(f"stereo: {what}", *gap) for what, gap in gaps.items()]
 
 
 def step_check(config: TrainConfig, device: torch.device) -> Check:

@@ -4,9 +4,9 @@
         [--run-steps 30000] [--frames 5] [--capture FOLDER] [--hbm-tb-s 4.8] [--half-tflops 989]
         [--l2-tb-s 5.5] [--json out/gpu_speed.json]
 
-First every kernel against its plain twin, and whole steps of both engines (`gpu_checks`); where one
-is wrong the rest is not measured. Then the paper's sampling (256, 96, 48) as it is after its
-warm-up (proposals learn in every 5th step), a new model for each way, in turn: `graph`, the
+First every kernel against its plain twin, stereo, and whole steps of both engines (`gpu_checks`);
+where one is wrong the rest is not measured. Then the paper's sampling (256, 96, 48) as it is after
+its warm-up (proposals learn in every 5th step), a new model for each way, in turn: `graph`, the
 captured step with Triton kernels; `eager`, the same kernels started one by one; with `--vs plain`
 also PyTorch's definitions. The first steps of each (`--skip`: compiling, capturing) are not
 counted. Then: time by phase and by kernel, networks fused and layer by layer, bytes and operations
@@ -231,14 +231,16 @@ def measured(
     config: of the whole run; the steps are those of the same model after its warm-up.
     """
     # Imported here: Triton has no wheel for every platform, and without a GPU nothing needs it.
-    from tests.benchmarks.gpu_checks import kernel_checks, print_checks, step_check
+    from tests.benchmarks.gpu_checks import kernel_checks, print_checks, step_check, stereo_checks
 
     model = config.model
     assert isinstance(model, NerfactoConfig)
-    checks = [*kernel_checks(model, CHECKED_POINTS, device), step_check(config, device)]
+    checks = [*kernel_checks(model, CHECKED_POINTS, device), *stereo_checks(device)]
+    checks.append(step_check(config, device))
     values["checks"] = [{**asdict(check), "passed": check.passed} for check in checks]
     if not print_checks(checks):
-        print("\nThe GPU engine is wrong here, so nothing was timed. Use train.engine=plain.")
+        print("\nThe GPU engine is wrong here, so nothing was timed.")
+        print("Use train.engine=plain, and depth.device=cpu where stereo is wrong.")
         return STATUS_WRONG
     if given.capture is None:
         capture = ball_capture(MADE_IMAGES, MADE_WIDTH, MADE_HEIGHT, device)

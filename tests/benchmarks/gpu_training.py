@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.devices import choose_device
 from pipelines.nerf.engines.gpu.step import TrainingStep, capturable_adam, loss_scaler
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.networks.fields import MLP
@@ -25,7 +26,6 @@ from pipelines.nerf.options.parts import ModelConfig
 from pipelines.nerf.options.train import TrainConfig
 from pipelines.nerf.space.cameras import Cameras
 from pipelines.nerf.training.loop import train
-from pipelines.nerf.training.state import choose_device
 from tests.benchmarks.capture_data import BenchmarkCapture
 from tests.benchmarks.machine import wait_for_gpu
 from tests.benchmarks.phases import PhaseClock, watching

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from pipelines.nerf.devices import choose_device
 from pipelines.nerf.judging.metrics import psnr
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.options.render import ALL_SAMPLES, RenderConfig
@@ -31,7 +32,6 @@ from pipelines.nerf.options.train import DataConfig
 from pipelines.nerf.renderer import RenderedImage, Renderer
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.training.checkpoint import load_model
-from pipelines.nerf.training.state import choose_device
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import load_capture
 from tests.benchmarks.machine import describe, heading, wait_for_gpu

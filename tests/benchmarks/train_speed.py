@@ -26,11 +26,11 @@ from typing import Any
 import torch
 
 from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.devices import choose_device
 from pipelines.nerf.options.catalogue import find_method
 from pipelines.nerf.options.train import TrainConfig
 from pipelines.nerf.space.cameras import Cameras
 from pipelines.nerf.training.loop import TrainProgress, train
-from pipelines.nerf.training.state import choose_device
 from tests.benchmarks import reference
 from tests.benchmarks.capture_data import BenchmarkCapture, load_capture
 from tests.benchmarks.machine import describe, heading, wait_for_gpu

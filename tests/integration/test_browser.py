@@ -40,7 +40,9 @@ def _square(textured: bool) -> TriangleMesh | TexturedMesh:
 @pytest.mark.slow
 @pytest.mark.parametrize("textured", [False, True], ids=["vertex-colours", "texture"])
 @pytest.mark.parametrize(
-    "style", [GlbStyle(), GlbStyle(quantized=True)], ids=["plain", "quantized"]
+    "style",
+    [GlbStyle(), GlbStyle(quantized=True), GlbStyle(compressed=True)],
+    ids=["plain", "quantized", "compressed"],
 )
 def test_three_js_shows_a_mesh_upright_in_its_colours(
     tmp_path: Path, textured: bool, style: GlbStyle

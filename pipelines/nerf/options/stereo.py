@@ -54,6 +54,12 @@ class StereoConfig:
         "colours. auto does where surfaces that pictures share show that the light drifts.",
         choices=("auto", "on", "off"),
     )
+    device: str = option(
+        "auto",
+        "Where pictures are compared: on a GPU with PyTorch, or on the CPU. Depths differ by "
+        "rounding. auto takes a GPU that gives the CPU's values.",
+        choices=("auto", "cpu", "cuda"),
+    )
     standing_walls: bool = option(
         True,
         "Lay patches of even brightness on upright planes where they meet a floor along a line "

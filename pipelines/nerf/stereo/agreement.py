@@ -1,4 +1,4 @@
-"""Whether other views' own depths agree with a depth map, in plain PyTorch.
+"""Whether other views' own depths agree with a depth map, in PyTorch.
 
 Symbols: depth [H, W] along the camera's axis (z), 0 where unknown; OpenCV cameras. The kernel twin
 is `engines.cpu.stereo.agreement`. The scheme is that of COLMAP's fusion and of the MVSNet filters.
@@ -31,10 +31,9 @@ def count_votes(
     more than twice that; HIDDEN: one before it. sums: [H, W], of the depths in this view where it
     agrees.
     """
-    point = torch.stack([rays[0][None, :] * depth, rays[1][:, None] * depth, depth], dim=-1)
-    rotation, shift = other_from_this[:, :3], other_from_this[:, 3]
-    there = point @ rotation.T + shift
-    px, py, pz = there.unbind(-1)
+    x, y = rays[0][None, :] * depth, rays[1][:, None] * depth
+    # Written out: a product of matrices may be rounded to fewer bits on a GPU.
+    px, py, pz = (row[0] * x + row[1] * y + row[2] * depth + row[3] for row in other_from_this)
     fx, fy, cx, cy = lens
     u, v = fx * px / pz + cx, fy * py / pz + cy
     rows, columns = other.shape
@@ -48,5 +47,7 @@ def count_votes(
     votes[AGREE] += agree
     votes[SEE_THROUGH] += behind
     votes[HIDDEN] += seen & ~agree & (gap < 0)
-    moved = there * (known / pz)[..., None] - shift
-    sums += torch.where(agree, moved @ rotation[:, 2], 0.0)
+    (a, b, c), shift = other_from_this[:, 2], other_from_this[:, 3]
+    moved = known / pz
+    back = a * (px * moved - shift[0]) + b * (py * moved - shift[1]) + c * (known - shift[2])
+    sums += torch.where(agree, back, 0.0)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.nerf.data.light import Light, exposed, in_logarithms, is_measurable
+from pipelines.nerf.stereo.shelves import ByView
 from pipelines.nerf.stereo.views import StereoView
 
 Floats = NDArray[np.float64]
@@ -72,8 +73,8 @@ class _Shared:
 
 def find_light(
     views: Sequence[StereoView],
-    depths: Sequence[Depths],
-    pictures: Sequence[NDArray[np.uint8]],
+    depths: ByView[Depths],
+    pictures: ByView[NDArray[np.uint8]],
     neighbours: Sequence[Sequence[int]],
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> CaptureLight:

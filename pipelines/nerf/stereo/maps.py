@@ -1,27 +1,23 @@
 """Depth maps of a capture from its pictures alone: plane sweep, aggregation, votes.
 
-Symbols: V views. Depth is along the camera's axis (z), world units, 0 where it is not known. The
-kernels of `engines.cpu.stereo` compute, whatever else the machine has. What they are used for:
-docs/surfaces.md.
+Symbols: V views. Depth is along the camera's axis (z), world units, 0 where it is not known. Who
+computes: `stereo.engines`. What maps are used for: docs/surfaces.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipelines.nerf.engines.cpu.stereo.aggregation import aggregate_fast
-from pipelines.nerf.engines.cpu.stereo.agreement import count_votes_fast
-from pipelines.nerf.engines.cpu.stereo.matching import matching_cost_fast
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.aggregation import jump_weights
 from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
-from pipelines.nerf.stereo.matching import plane_homographies
+from pipelines.nerf.stereo.engines import KERNELS, Engine, homographies_to
 from pipelines.nerf.stereo.neighbours import choose_neighbours, depth_range, spread_apart
+from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
 from pipelines.nerf.stereo.views import StereoView, camera_extent
 
 Floats = NDArray[np.float64]
@@ -44,21 +40,77 @@ class DepthMap:
     votes: NDArray[np.uint8]
 
 
+class MapShelf:
+    """The depth maps of a capture on two shelves: `z` and `votes`. name: that they are kept by."""
+
+    def __init__(self, z: Shelf, votes: Shelf, name: str = "") -> None:
+        self.z, self.votes, self.name = z, votes, name
+
+    @classmethod
+    def kept(cls, shelves: Shelves, name: str, count: int, *, fresh: bool = False) -> MapShelf:
+        """See `Shelves`."""
+        z, votes = (shelves.kept(part, count, fresh=fresh) for part in cls.parts_of(name))
+        return cls(z, votes, name)
+
+    @classmethod
+    def of(cls, maps: Sequence[DepthMap]) -> MapShelf:
+        """Those maps, in memory."""
+        held = cls.kept(MEMORY, "", len(maps))
+        for index, found in enumerate(maps):
+            held[index] = found
+        return held
+
+    @staticmethod
+    def parts_of(name: str) -> tuple[str, str]:
+        """The names of the two shelves."""
+        return f"{name}-z", f"{name}-votes"
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def __iter__(self) -> Iterator[DepthMap]:
+        return (self[index] for index in range(len(self)))
+
+    def has(self, index: int) -> bool:
+        """Whether that view's map lies there."""
+        return self.z.has(index) and self.votes.has(index)
+
+    def __getitem__(self, index: int, /) -> DepthMap:
+        return DepthMap(self.z[index], self.votes[index])
+
+    def __setitem__(self, index: int, found: DepthMap, /) -> None:
+        self.z[index] = found.z
+        self.votes[index] = found.votes
+
+
+def depths_of(maps: ByView[DepthMap]) -> ByView[NDArray[np.float32]]:
+    """The maps' depths alone."""
+    return maps.z if isinstance(maps, MapShelf) else [found.z for found in maps]
+
+
 def find_depth_maps(
     views: Sequence[StereoView],
     config: StereoConfig,
     points: Floats | None = None,
     on_progress: Progress = lambda fraction, message: None,
-) -> list[DepthMap]:
+    engine: Engine = KERNELS,
+    shelves: Shelves = MEMORY,
+) -> MapShelf:
     """A depth map for each view, agreed upon by others; empty where a view has no neighbours.
 
     points: [P, 3], world: what is known of the scene, as from structure from motion; None has a
     coarse pass over some views look for them. on_progress: fraction and message; may raise.
+    shelves: what lies there of points, the views' own depths and maps is not sought again; it is of
+    the same views, points, options and engine.
     """
     begun = 0.0
     if points is None or len(points) < _MAX_POINTS // 100:
-        points = find_points(views, config, lambda f, text: on_progress(_PROBE_SHARE * f, text))
-        begun = _PROBE_SHARE
+        probed = shelves.kept("points", 1)
+        if not probed.has(0):
+            probed[0] = find_points(
+                views, config, lambda f, text: on_progress(_PROBE_SHARE * f, text), engine
+            )
+        points, begun = probed[0], _PROBE_SHARE
     points = thinned(points)
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
     ranges = [depth_range(view, points) for view in views]
@@ -68,21 +120,28 @@ def find_depth_maps(
         if known
         else None
     )
-    raw: list[NDArray[np.float32]] = []
+    raw = shelves.kept("raw", len(views))
     for index, view in enumerate(views):
-        limits = ranges[index] or typical
-        others = [views[other] for other in neighbours[index]]
-        raw.append(_sweep(view, others, limits, config))
+        if not raw.has(index):
+            limits = ranges[index] or typical
+            others = [views[other] for other in neighbours[index]]
+            raw[index] = _sweep(view, others, limits, config, engine)
         share = (index + 1) / len(views) * (1.0 - begun - _VOTE_SHARE)
         on_progress(begun + share, f"depth {index + 1}/{len(views)}")
-    maps = []
+    maps = MapShelf.kept(shelves, "matched", len(views))
     for index in range(len(views)):
-        maps.append(agreed(index, views, raw, neighbours[index], config))
+        if not maps.has(index):
+            maps[index] = agreed(index, views, raw, neighbours[index], config, engine)
         on_progress(1.0 - _VOTE_SHARE * (1.0 - (index + 1) / len(views)), "comparing depths")
     return maps
 
 
-def find_points(views: Sequence[StereoView], config: StereoConfig, on_progress: Progress) -> Floats:
+def find_points(
+    views: Sequence[StereoView],
+    config: StereoConfig,
+    on_progress: Progress,
+    engine: Engine = KERNELS,
+) -> Floats:
     """Some points [P, 3] on the scene's surfaces, from small pictures of some views."""
     picked = np.unique(np.linspace(0, len(views) - 1, _PROBE_VIEWS).round().astype(int))
     longest = max(views[0].picture.shape)
@@ -94,11 +153,12 @@ def find_points(views: Sequence[StereoView], config: StereoConfig, on_progress: 
     raw = []
     for index, view in enumerate(some):
         others = [some[other] for other in neighbours[index]]
-        raw.append(_sweep(view, others, (near, _PROBE_FARTHEST * near / _PROBE_NEAREST), coarse))
+        limits = near, _PROBE_FARTHEST * near / _PROBE_NEAREST
+        raw.append(_sweep(view, others, limits, coarse, engine))
         on_progress((index + 1) / len(some), f"looking for surfaces {index + 1}/{len(some)}")
     found = [np.zeros((0, 3))]
     for index, view in enumerate(some):
-        kept = agreed(index, some, raw, neighbours[index], coarse)
+        kept = agreed(index, some, raw, neighbours[index], coarse, engine)
         found.append(back_project(view, kept.z))
     return np.concatenate(found)
 
@@ -114,7 +174,7 @@ def back_project(view: StereoView, z: NDArray[np.float32]) -> Floats:
 
 
 def surface_points(
-    views: Sequence[StereoView], depths: Sequence[NDArray[np.float32] | None]
+    views: Sequence[StereoView], depths: ByView[NDArray[np.float32] | None]
 ) -> Floats:
     """Some points [P, 3], world, on what the depth maps know; None for a view without a map."""
     found = [
@@ -138,40 +198,42 @@ def _sweep(
     others: Sequence[StereoView],
     limits: tuple[float, float] | None,
     config: StereoConfig,
+    engine: Engine,
 ) -> NDArray[np.float32]:
     """The view's own opinion, [H, W] float32, before others are asked."""
     if not others or limits is None:
         return np.zeros(view.picture.shape, np.float32)
     near, far = limits
     inverse = torch.linspace(1.0 / far, 1.0 / near, config.num_planes, dtype=torch.float64)
-    homographies = plane_homographies(
-        torch.from_numpy(view.matrix()),
-        torch.from_numpy(np.stack([other.matrix() for other in others])),
-        torch.from_numpy(np.stack([other.from_other(view) for other in others])).double(),
-        inverse,
-    )
-    pictures = np.stack([other.picture for other in others])
+    homographies = homographies_to(view, others, inverse.numpy())
+    pictures = _together([other.picture for other in others])
     reference = np.maximum(view.picture, 0.0)
-    cost = matching_cost_fast(
-        reference, pictures, homographies.numpy().astype(np.float32), config.window_radius
-    )
-    weights = jump_weights(torch.from_numpy(reference), config.edge_scale).numpy()
-    planes, _ = aggregate_fast(cost, weights, config.smooth_small, config.smooth_large)
+    planes = engine.best_planes(reference, pictures, homographies, config)
     step = float(inverse[1] - inverse[0])
     z = 1.0 / (float(inverse[0]) + planes.astype(np.float64) * step)
     return np.where(view.picture >= 0.0, z, 0.0).astype(np.float32)
 
 
+def _together(pictures: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Pictures of any sizes as one block [N, H, W]; what a smaller one has not is no picture."""
+    height, width = np.max([picture.shape for picture in pictures], axis=0)
+    block = np.full((len(pictures), height, width), -1.0, np.float32)
+    for place, picture in zip(block, pictures, strict=True):
+        place[: picture.shape[0], : picture.shape[1]] = picture
+    return block
+
+
 def agreed(
     index: int,
     views: Sequence[StereoView],
-    depths: Sequence[NDArray[np.float32]],
+    depths: ByView[NDArray[np.float32]],
     neighbours: Sequence[int],
     config: StereoConfig,
+    engine: Engine = KERNELS,
 ) -> DepthMap:
     """A view's depths that enough neighbours confirm, and not more see through; averaged."""
     depth = depths[index]
-    votes, sums = votes_of_others(index, views, depths, neighbours, config)
+    votes, sums = votes_of_others(depth, index, views, depths, neighbours, config, engine)
     kept = (depth > 0) & (votes[AGREE] >= config.min_agreeing) & (votes[AGREE] > votes[SEE_THROUGH])
     mean = (depth + sums) / (1.0 + votes[AGREE])
     return DepthMap(
@@ -181,29 +243,14 @@ def agreed(
 
 
 def votes_of_others(
+    depth: NDArray[np.float32],
     index: int,
     views: Sequence[StereoView],
-    depths: Sequence[NDArray[np.float32]],
+    depths: ByView[NDArray[np.float32]],
     neighbours: Sequence[int],
     config: StereoConfig,
+    engine: Engine = KERNELS,
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """What its neighbours' depths say of a view's; see `stereo.agreement`.
-
-    Returns ([3, H, W] votes; [H, W] sums of the depths, in this view, of those that agree).
-    """
-    view, depth = views[index], depths[index]
-    votes = np.zeros((3, *depth.shape), np.int32)
-    sums = np.zeros(depth.shape, np.float32)
-    rays = view.rays()
-    for other in neighbours:
-        count_votes_fast(
-            depth,
-            rays,
-            views[other].from_other(view),
-            depths[other],
-            np.array(views[other].lens, np.float32),
-            config.agree_within,
-            votes,
-            sums,
-        )
-    return votes, sums
+    """What its neighbours' depths say of a view's `depth`; see `Engine.votes`."""
+    others = [(views[other], depths[other]) for other in neighbours]
+    return engine.votes(views[index], depth, others, config.agree_within)

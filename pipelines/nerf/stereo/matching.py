@@ -1,7 +1,8 @@
-"""How well neighbours match a picture at each depth: plane sweep with ZNCC, in plain PyTorch.
+"""How well neighbours match a picture at each depth: plane sweep with ZNCC, in PyTorch.
 
 Symbols: reference [H, W], N neighbours, D planes. Brightness in [0, 1]; a negative one means that
-there is no picture. The kernel twin is `engines.cpu.stereo.matching`.
+there is no picture. The kernel twin is `engines.cpu.stereo.matching`. What runs here runs on any
+device; nothing asks it for a value, and no matrix product may be rounded to fewer bits.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from torch import Tensor
 
 VARIANCE_FLOOR = 2e-5
 UNSEEN_COST = 1.0
+WARPED_BYTES = 128
+"""What a pixel of a plane takes while it is compared, at most."""
 
 
 def plane_homographies(
@@ -30,68 +33,94 @@ def plane_homographies(
     return maps
 
 
-def matching_cost(reference: Tensor, others: Tensor, homographies: Tensor, radius: int) -> Tensor:
+def matching_cost(
+    reference: Tensor, others: Tensor, homographies: Tensor, radius: int, at_once: int = 8
+) -> Tensor:
     """1 - ZNCC at every pixel and plane: the mean of the best two neighbours.
 
     reference: [H, W]. others: [N, H', W']. homographies: [N, D, 3, 3] of `plane_homographies`.
-    radius: of the square windows, cut at the border. Returns [D, H, W] in [0, 2]; 1 where no
+    radius: of the square windows, cut at the border. at_once: planes that are compared together,
+    each for `WARPED_BYTES` a pixel. Returns [D, H, W] in [0, 2]; 1 where no
     neighbour sees the plane. The best half as in COLMAP and Kang, Szeliski, Chai (CVPR 2001): a
     neighbour before which something stands has no say.
     """
     reference = reference.float()
-    height, width = reference.shape
     counts = _box_sums(torch.ones_like(reference), radius)
-    mean_r = _box_sums(reference, radius) / counts
-    var_r = (_box_sums(reference * reference, radius) / counts - mean_r.square()).clamp_min(0.0)
-    planes = []
-    for plane in range(homographies.shape[1]):
-        costs = []
-        for other, homography in zip(others, homographies[:, plane], strict=True):
-            shown, seen = _warp(other, homography, height, width)
-            mean_o = _box_sums(shown, radius) / counts
-            var_o = (_box_sums(shown * shown, radius) / counts - mean_o.square()).clamp_min(0.0)
-            covariance = _box_sums(shown * reference, radius) / counts - mean_r * mean_o
-            scale = (var_r + VARIANCE_FLOOR) * (var_o + VARIANCE_FLOOR)
-            found = 1.0 - covariance / scale.sqrt()
-            costs.append(torch.where(seen, found, torch.inf))
-        best = torch.stack(costs).sort(dim=0).values[:2]
-        mean = torch.where(best[-1].isfinite(), best.mean(dim=0), best[0])
-        planes.append(torch.where(best[0].isfinite(), mean, UNSEEN_COST))
-    return torch.stack(planes)
+    mean = _box_sums(reference, radius) / counts
+    variance = (_box_sums(reference * reference, radius) / counts - mean.square()).clamp_min(0.0)
+    told = reference, mean, (variance + VARIANCE_FLOOR).rsqrt(), counts
+    corners = [_corners(other) for other in others]
+    cost = reference.new_empty(homographies.shape[1], *reference.shape)
+    for first in range(0, len(cost), at_once):
+        planes = slice(first, first + at_once)
+        best = torch.full_like(cost[planes], torch.inf)
+        second = best.clone()
+        for each, maps in zip(corners, homographies[:, planes], strict=True):
+            found = _costs(told, *each, maps, radius)
+            second = torch.minimum(second, torch.maximum(best, found))
+            best = torch.minimum(best, found)
+        both = torch.where(second.isfinite(), 0.5 * (best + second), best)
+        cost[planes] = torch.where(best.isfinite(), both, UNSEEN_COST)
+    return cost
+
+
+def _costs(
+    told: tuple[Tensor, Tensor, Tensor, Tensor],
+    corners: Tensor,
+    usable: Tensor,
+    homographies: Tensor,
+    radius: int,
+) -> Tensor:
+    """[P, H, W], 1 - ZNCC of P planes in one neighbour; infinite where it does not show them.
+
+    told: of the reference, [H, W] each: brightness, its mean in the windows, 1 / deviation, counts.
+    """
+    reference, mean, scale, counts = told
+    shown, seen = _warped(corners, usable, homographies, *reference.shape)
+    sums = _box_sums(torch.stack([shown, shown * shown, shown * reference]), radius) / counts
+    variance = (sums[1] - sums[0].square()).clamp_min(0.0) + VARIANCE_FLOOR
+    covariance = sums[2] - mean * sums[0]
+    found = 1.0 - covariance * scale / variance.sqrt()
+    return torch.where(seen, found, torch.inf)
 
 
 def _box_sums(values: Tensor, radius: int) -> Tensor:
-    """[H, W] sums over squares of side 2 radius + 1, cut at the border."""
-    side = 2 * radius + 1
-    pooled = torch.nn.functional.avg_pool2d(
-        values[None, None], side, stride=1, padding=radius, divisor_override=1
-    )
-    return pooled[0, 0]
+    """[..., H, W] sums over squares of side 2 radius + 1, cut at the border."""
+    side, (height, width) = 2 * radius + 1, values.shape[-2:]
+    sums = values.reshape(-1, 1, height, width)
+    for window, padding in (((side, 1), (radius, 0)), ((1, side), (0, radius))):
+        sums = torch.nn.functional.avg_pool2d(
+            sums, window, stride=1, padding=padding, divisor_override=1
+        )
+    return sums.reshape(values.shape)
 
 
-def _warp(other: Tensor, homography: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """(the neighbour on the reference's pixels [H, W], 0 where unseen; where it is seen)."""
-    rows, columns = other.shape
-    y, x = torch.meshgrid(
-        torch.arange(height, device=other.device),
-        torch.arange(width, device=other.device),
-        indexing="ij",
+def _corners(other: Tensor) -> tuple[Tensor, Tensor]:
+    """Of each square of four pixels of a picture its brightness [H' - 1, W' - 1, 4], and whether
+    all four have one."""
+    corners = torch.stack([other[:-1, :-1], other[:-1, 1:], other[1:, :-1], other[1:, 1:]], dim=-1)
+    return corners, (corners >= 0.0).all(dim=-1)
+
+
+def _warped(
+    corners: Tensor, usable: Tensor, homographies: Tensor, height: int, width: int
+) -> tuple[Tensor, Tensor]:
+    """(the neighbour on the reference's pixels [P, H, W], 0 where unseen; where it is seen)."""
+    maps = homographies[..., None, None]
+    x = torch.arange(width, device=corners.device, dtype=homographies.dtype)
+    y = torch.arange(height, device=corners.device, dtype=homographies.dtype)[:, None]
+    u, v, depth = (
+        maps[:, row, 0] * x + (maps[:, row, 1] * y + maps[:, row, 2]) for row in range(3)
     )
-    grid = torch.stack([x, y, torch.ones_like(x)], dim=-1).to(homography.dtype)
-    u, v, depth = (grid @ homography.T).unbind(-1)
     u, v = u / depth, v / depth
-    seen = (depth > 0) & (u >= 0) & (v >= 0) & (u < columns - 1) & (v < rows - 1)
-    i, j = (torch.where(seen, w, 0.0).floor().long() for w in (u, v))
-    corners = torch.stack(
-        [
-            other[j, i],
-            other[j, (i + 1).clamp_max(columns - 1)],
-            other[(j + 1).clamp_max(rows - 1), i],
-            other[(j + 1).clamp_max(rows - 1), (i + 1).clamp_max(columns - 1)],
-        ]
-    )
-    seen &= (corners >= 0.0).all(dim=0)
+    rows, columns = usable.shape
+    seen = (depth > 0) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+    u, v = torch.where(seen, u, 0.0), torch.where(seen, v, 0.0)
+    i, j = u.long(), v.long()
+    at = j * columns + i
+    seen &= usable.flatten()[at]
+    four = corners.flatten(0, 1)[at]
     fu, fv = (u - i).float(), (v - j).float()
-    top = corners[0] + fu * (corners[1] - corners[0])
-    bottom = corners[2] + fu * (corners[3] - corners[2])
+    top = four[..., 0] + fu * (four[..., 1] - four[..., 0])
+    bottom = four[..., 2] + fu * (four[..., 3] - four[..., 2])
     return torch.where(seen, top + fv * (bottom - top), 0.0), seen

@@ -26,14 +26,14 @@ def patches_of(picture: NDArray[np.float32]) -> Labels:
     return found
 
 
-def even_patches(picture: NDArray[np.float32]) -> Labels:
-    """The same, patches that only shading divides joined.
+def even_patches(picture: NDArray[np.float32], patches: Labels | None = None) -> Labels:
+    """The picture's `patches_of`, those that only shading divides joined.
 
     A wall that light falls on from one side comes in bands. Two patches are one where their
     brightness differs by less than 3 of 255 in the mean over the border that they share, two pixels
     from it on either side.
     """
-    patches = patches_of(picture)
+    patches = patches_of(picture) if patches is None else patches
     num = int(patches.max()) + 1
     pairs, steps = zip(
         *(_steps(labels, shown, num) for labels, shown in _both_ways(patches, _shown(picture))),

@@ -19,9 +19,18 @@ from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
-from pipelines.nerf.stereo.maps import DepthMap, Progress, surface_points, votes_of_others
+from pipelines.nerf.stereo.engines import KERNELS, Engine
+from pipelines.nerf.stereo.maps import (
+    DepthMap,
+    MapShelf,
+    Progress,
+    depths_of,
+    surface_points,
+    votes_of_others,
+)
 from pipelines.nerf.stereo.neighbours import choose_neighbours
-from pipelines.nerf.stereo.patches import patches_of
+from pipelines.nerf.stereo.patches import Labels, patches_of
+from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
 from pipelines.nerf.stereo.views import StereoView
 
 Depths = NDArray[np.float32]
@@ -42,23 +51,27 @@ _EXTRAPOLATED = 3.0
 
 def completed(
     views: Sequence[StereoView],
-    maps: Sequence[DepthMap],
+    maps: MapShelf,
     config: StereoConfig,
     on_progress: Progress = lambda fraction, message: None,
-) -> list[DepthMap]:
+    engine: Engine = KERNELS,
+    shelves: Shelves = MEMORY,
+    patches: Shelf | None = None,
+) -> MapShelf:
     """The maps with their plain patches on the planes of the scene.
 
     Depths within 1 % of their patch's plane move onto it; unknown pixels of the patch get its depth
-    unless more neighbours see through it than agree. All others stay as they are.
+    unless more neighbours see through it than agree. All others stay as they are. patches: a shelf
+    for the pictures' `patches_of`, or with them.
     """
     planes = find_planes(views, maps, lambda f: on_progress(_SAMPLES_SHARE * f, _MESSAGE))
     if len(planes) == 0:
-        return list(maps)
-    points = surface_points(views, [found.z for found in maps])
+        return maps
+    points = surface_points(views, depths_of(maps))
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
-    filled = []
-    for index, (view, found) in enumerate(zip(views, maps, strict=True)):
-        filled.append(laid_on_planes(view, found.z, planes))
+    filled = shelves.scratch("on planes", len(views))
+    for index, (view, z) in enumerate(zip(views, depths_of(maps), strict=True)):
+        filled[index] = laid_on_planes(view, z, planes, shelved_patches(view, index, patches))
         share = (1.0 - _VOTES_SHARE - _SAMPLES_SHARE) * (index + 1) / len(views)
         on_progress(_SAMPLES_SHARE + share, _MESSAGE)
     return confirmed(
@@ -69,34 +82,47 @@ def completed(
         config,
         lambda agree, through: agree < through,
         lambda done: on_progress(1.0 - _VOTES_SHARE * (1.0 - done), _MESSAGE),
+        engine,
+        MapShelf.kept(shelves, "planes", len(views), fresh=True),
     )
+
+
+def shelved_patches(view: StereoView, index: int, shelf: Shelf | None) -> Labels:
+    """`patches_of` a view's picture, found once where there is a shelf for them."""
+    if shelf is None:
+        return patches_of(view.picture)
+    if not shelf.has(index):
+        shelf[index] = patches_of(view.picture)
+    found: Labels = shelf[index]
+    return found
 
 
 def confirmed(
     views: Sequence[StereoView],
-    maps: Sequence[DepthMap],
-    filled: Sequence[Depths],
+    maps: ByView[DepthMap],
+    filled: ByView[Depths],
     neighbours: Sequence[Sequence[int]],
     config: StereoConfig,
     refutes: Callable[[NDArray[np.int32], NDArray[np.int32]], NDArray[np.bool_]],
     on_progress: Callable[[float], None],
-) -> list[DepthMap]:
-    """The filled maps, as the maps were where neighbours refute a depth that is new.
+    engine: Engine,
+    kept: MapShelf,
+) -> MapShelf:
+    """The filled maps, as the maps were where neighbours refute a depth that is new, on `kept`.
 
     refutes: of the numbers of neighbours, [H, W] each, that agree and that see through.
     on_progress: told the share that is done; may raise.
     """
-    kept = []
     for index, found in enumerate(maps):
-        votes, _ = votes_of_others(index, views, filled, neighbours[index], config)
+        votes, _ = votes_of_others(
+            filled[index], index, views, filled, neighbours[index], config, engine
+        )
         moved = np.abs(filled[index] - found.z) > 2.0 * ON_PLANE * found.z
         guessed = (filled[index] > 0) & moved
         refuted = guessed & refutes(votes[AGREE], votes[SEE_THROUGH])
-        kept.append(
-            DepthMap(
-                np.where(refuted, found.z, filled[index]),
-                np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
-            )
+        kept[index] = DepthMap(
+            np.where(refuted, found.z, filled[index]),
+            np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
         )
         on_progress((index + 1) / len(views))
     return kept
@@ -104,16 +130,27 @@ def confirmed(
 
 def find_planes(
     views: Sequence[StereoView],
-    maps: Sequence[DepthMap],
+    maps: ByView[DepthMap],
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> Floats:
-    """The planes [P, 4] (n, d) that most of the known surfaces lie on, largest first.
+    """The planes [P, 4] (n, d) that most of the known surfaces lie on; see `planes_and_samples`."""
+    return planes_and_samples(views, maps, on_progress)[0]
+
+
+def planes_and_samples(
+    views: Sequence[StereoView],
+    maps: ByView[DepthMap],
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> tuple[Floats, Floats, Floats]:
+    """The planes [P, 4] (n, d) that most of the known surfaces lie on, largest first; and some of
+    the points that the maps know, [K, 3], world, with their depths [K].
 
     One after the other by RANSAC over points with their normals; each has at least 1 % of them.
     on_progress: told the share that is done; may raise.
     """
     rng = np.random.default_rng(0)
-    points, normals, depths = _samples(views, maps, rng, on_progress)
+    every = _samples(views, maps, rng, on_progress)
+    points, normals, depths = every
     least = max(_LEAST_SHARE * len(points), _MIN_KNOWN)
     planes: list[Floats] = []
     while len(points) >= least and len(planes) < _MOST_PLANES:
@@ -133,14 +170,14 @@ def find_planes(
         planes.append(plane)
         rest = ~_on_plane(plane, points, normals, depths, slack=2.0)
         points, normals, depths = points[rest], normals[rest], depths[rest]
-    return np.array(planes).reshape(-1, 4)
+    return np.array(planes).reshape(-1, 4), every[0], every[2]
 
 
-def laid_on_planes(view: StereoView, z: Depths, planes: Floats) -> Depths:
+def laid_on_planes(view: StereoView, z: Depths, planes: Floats, patches: Labels) -> Depths:
     """A depth map [H, W] whose patches lie on the planes that their known pixels lie on.
 
-    planes: [P, 4]. A patch goes to the plane that most of its known pixels are within 2 % of, if
-    half of them are.
+    planes: [P, 4]. patches: [H, W], of the picture. A patch goes to the plane that most of its
+    known pixels are within 2 % of, if half of them are.
     """
     offsets = planes[:, 3] - planes[:, :3] @ view.center
     apart = np.abs(offsets) > 1e-9
@@ -151,7 +188,6 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats) -> Depths:
     x, y = (axis.astype(np.float64) for axis in view.rays())
     known = z > 0
     inverse = np.where(known, 1.0 / np.where(known, z, 1.0), 0.0)
-    patches = patches_of(view.picture)
     num_patches = int(patches.max()) + 1
 
     def near(found: Floats) -> NDArray[np.bool_]:
@@ -211,7 +247,7 @@ def _rays(view: StereoView) -> Floats:
 
 def _samples(
     views: Sequence[StereoView],
-    maps: Sequence[DepthMap],
+    maps: ByView[DepthMap],
     rng: np.random.Generator,
     on_progress: Callable[[float], None],
 ) -> tuple[Floats, Floats, Floats]:
@@ -233,12 +269,6 @@ def _samples(
         return every
     some = rng.choice(len(every[0]), _MOST_SAMPLES, replace=False)
     return every[0][some], every[1][some], every[2][some]
-
-
-def known_samples(views: Sequence[StereoView], maps: Sequence[DepthMap]) -> tuple[Floats, Floats]:
-    """Some of the points that the maps know, [K, 3], world, and their depths [K]."""
-    points, _, depths = _samples(views, maps, np.random.default_rng(0), lambda fraction: None)
-    return points, depths
 
 
 def _normals(rays: Floats, z: Depths) -> tuple[Floats, NDArray[np.bool_]]:

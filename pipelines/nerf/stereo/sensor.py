@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
-from pipelines.nerf.stereo.maps import DepthMap, surface_points, votes_of_others
+from pipelines.nerf.stereo.engines import KERNELS, Engine
+from pipelines.nerf.stereo.maps import DepthMap, MapShelf, surface_points, votes_of_others
 from pipelines.nerf.stereo.neighbours import choose_neighbours
+from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelves
 from pipelines.nerf.stereo.views import StereoView
 
 Depths = NDArray[np.float32]
@@ -42,7 +44,7 @@ class SensorScale:
     spread: float | None
 
 
-def sensor_scale(stereo: Sequence[DepthMap], sensed: Sequence[Depths | None]) -> SensorScale:
+def sensor_scale(stereo: ByView[DepthMap], sensed: Sequence[Depths | None]) -> SensorScale:
     """Compare the maps of both where both know a pixel.
 
     Only ratios that hold together count (spread up to 5 %), and only beyond 1 % and one and a half
@@ -62,8 +64,12 @@ def sensor_scale(stereo: Sequence[DepthMap], sensed: Sequence[Depths | None]) ->
 
 
 def sensor_maps(
-    views: Sequence[StereoView], sensed: Sequence[Depths | None], config: StereoConfig
-) -> list[DepthMap]:
+    views: Sequence[StereoView],
+    sensed: Sequence[Depths | None],
+    config: StereoConfig,
+    engine: Engine = KERNELS,
+    shelves: Shelves = MEMORY,
+) -> MapShelf:
     """The sensor's maps without what other views' sensors contradict; averaged where they agree.
 
     A sensor measures, stereo guesses: a depth that nobody else can speak of is kept, as nearly all
@@ -76,14 +82,24 @@ def sensor_maps(
         np.zeros(view.picture.shape, np.float32) if z is None else z
         for view, z in zip(views, sensed, strict=True)
     ]
-    kept = []
+    kept = MapShelf.kept(shelves, "measured", len(views), fresh=True)
     for index, z in enumerate(maps):
-        votes, sums = votes_of_others(index, views, maps, neighbours[index], config)
+        votes, sums = votes_of_others(z, index, views, maps, neighbours[index], config, engine)
         agreeing = votes[AGREE]
         believed = (z > 0) & ((agreeing > votes[SEE_THROUGH]) | (votes.sum(axis=0) == 0))
         mean = np.where(believed, (z + sums) / (1.0 + agreeing), 0.0).astype(np.float32)
-        kept.append(DepthMap(mean, np.where(believed, agreeing, 0).astype(np.uint8)))
+        kept[index] = DepthMap(mean, np.where(believed, agreeing, 0).astype(np.uint8))
     return kept
+
+
+def merged_maps(
+    stereo: ByView[DepthMap], measured: ByView[DepthMap], shelves: Shelves = MEMORY
+) -> MapShelf:
+    """Both maps of each view as one; see `merged`."""
+    both = MapShelf.kept(shelves, "merged", len(stereo), fresh=True)
+    for index, (one, other) in enumerate(zip(stereo, measured, strict=True)):
+        both[index] = merged(one, other)
+    return both
 
 
 def merged(stereo: DepthMap, sensor: DepthMap) -> DepthMap:

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
-from pipelines.nerf.stereo.maps import DepthMap, votes_of_others
+from pipelines.nerf.stereo.engines import KERNELS, Engine
+from pipelines.nerf.stereo.maps import DepthMap, MapShelf, votes_of_others
 from pipelines.nerf.stereo.patches import Labels
 from pipelines.nerf.stereo.planes import ON_PLANE, Floats, inverse_depths, ray_grid
+from pipelines.nerf.stereo.shelves import ByView
 from pipelines.nerf.stereo.views import StereoView
 
 Depths = NDArray[np.float32]
@@ -70,43 +72,43 @@ def replaceable(z: Depths, inverse: Floats) -> Bools:
 
 def spread(
     looks: Sequence[PlainPatches],
-    before: Sequence[DepthMap],
-    maps: Sequence[DepthMap],
+    before: ByView[DepthMap],
+    maps: MapShelf,
     walls: Floats,
     neighbours: Sequence[Sequence[int]],
     config: StereoConfig,
     on_progress: Callable[[float], None] = lambda fraction: None,
-) -> list[DepthMap]:
-    """The maps with plain patches on the walls that their neighbours see there.
+    engine: Engine = KERNELS,
+) -> MapShelf:
+    """The maps with plain patches on the walls that their neighbours see there, on their shelf.
 
     before: the maps without walls. walls: [P, 4]. Each view is asked twice, there and back, so that
     a wall goes all the way along a film. on_progress: told the share that is done; may raise.
     """
     walls = walls[_well_laid(looks, before, maps, walls)]
-    views, found = [look.view for look in looks], list(maps)
-    depths = [each.z for each in maps]
+    views = [look.view for look in looks]
     order = [*range(len(looks)), *reversed(range(len(looks)))] if len(walls) else []
     for done, index in enumerate(order, start=1):
-        look, z = looks[index], depths[index]
+        look, z = looks[index], maps.z[index]
         num = int(look.patches.max()) + 1
         known = np.bincount(look.patches[z > 0], minlength=num)
         left = np.zeros(num, np.bool_)
         left[look.plain] = True
         left &= known < MOST_KNOWN * np.bincount(look.patches.ravel(), minlength=num)
-        laid = _on_walls(index, views, look, depths, walls, left, neighbours[index], config)
+        laid = _on_walls(index, views, look, maps.z, walls, left, neighbours[index], config, engine)
         if laid is not None:
-            depths[index], votes = laid
-            votes = np.where(depths[index] != z, votes, found[index].votes)
-            found[index] = DepthMap(depths[index], votes.astype(np.uint8))
+            new, votes = laid
+            votes = np.where(new != z, votes, maps.votes[index])
+            maps[index] = DepthMap(new, votes.astype(np.uint8))
         on_progress(done / len(order))
     on_progress(1.0)
-    return found
+    return maps
 
 
 def _well_laid(
     looks: Sequence[PlainPatches],
-    before: Sequence[DepthMap],
-    maps: Sequence[DepthMap],
+    before: ByView[DepthMap],
+    maps: ByView[DepthMap],
     walls: Floats,
 ) -> Bools:
     """[P]: which walls were laid on a good part of some pictures."""
@@ -123,11 +125,12 @@ def _on_walls(
     index: int,
     views: Sequence[StereoView],
     look: PlainPatches,
-    depths: Sequence[Depths],
+    depths: ByView[Depths],
     walls: Floats,
     left: Bools,
     neighbours: Sequence[int],
     config: StereoConfig,
+    engine: Engine,
 ) -> tuple[Depths, Votes] | None:
     """A view's map with the patches `left` [N] on walls that neighbours see, and how many of them.
 
@@ -146,8 +149,7 @@ def _on_walls(
     inverse = np.take_along_axis(inverses, best[look.patches][None], axis=0)[0]
     at = free & wanted[look.patches] & (inverse > 1e-9) & replaceable(z, inverse)
     guess = np.where(at, 1.0 / np.where(at, inverse, 1.0), 0.0).astype(np.float32)
-    tried = [*depths[:index], guess, *depths[index + 1 :]]
-    votes, _ = votes_of_others(index, views, tried, neighbours, config)
+    votes, _ = votes_of_others(guess, index, views, depths, neighbours, config, engine)
     taken = at & ~refutes(votes[AGREE], votes[SEE_THROUGH])
     laid: Depths = np.where(taken, guess, z)
     return laid, votes[AGREE]

@@ -24,18 +24,20 @@ from numpy.typing import NDArray
 from skimage.segmentation import expand_labels
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import DepthMap, Progress, surface_points
+from pipelines.nerf.stereo.engines import KERNELS, Engine
+from pipelines.nerf.stereo.maps import MapShelf, Progress, depths_of, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.patches import Labels, even_patches
 from pipelines.nerf.stereo.planes import (
     ON_PLANE,
     Floats,
     confirmed,
-    find_planes,
     inverse_depths,
-    known_samples,
+    planes_and_samples,
     ray_grid,
+    shelved_patches,
 )
+from pipelines.nerf.stereo.shelves import MEMORY, Shelf, Shelves
 from pipelines.nerf.stereo.spreading import (
     MOST_KNOWN,
     PlainPatches,
@@ -97,35 +99,41 @@ class _Wall:
 
 def stood_up(
     views: Sequence[StereoView],
-    maps: Sequence[DepthMap],
+    maps: MapShelf,
     config: StereoConfig,
     on_progress: Progress = lambda fraction, message: None,
-) -> list[DepthMap]:
+    engine: Engine = KERNELS,
+    shelves: Shelves = MEMORY,
+    patches: Shelf | None = None,
+) -> MapShelf:
     """The maps with plain patches on the walls that their borders with the floor tell of.
 
     Pixels of plain patches change that are unknown, or seem to be nearer than the wall: they get
-    its depth where a neighbour agrees and none sees through it, or twice as many agree.
+    its depth where a neighbour agrees and none sees through it, or twice as many agree. patches: a
+    shelf for the pictures' `patches_of`, or with them.
     """
-    planes = find_planes(views, maps, lambda done: on_progress(_PLANES_SHARE * done, _MESSAGE))
-    points, depths = known_samples(views, maps)
+    planes, points, depths = planes_and_samples(
+        views, maps, lambda done: on_progress(_PLANES_SHARE * done, _MESSAGE)
+    )
     floors = _floors(views, planes, points, depths)
     if not floors:
-        return list(maps)
+        return maps
     looks = []
-    for index, (view, found) in enumerate(zip(views, maps, strict=True)):
-        looks.append(_look(view, found.z, planes))
+    for index, (view, z) in enumerate(zip(views, depths_of(maps), strict=True)):
+        parts = even_patches(view.picture, shelved_patches(view, index, patches))
+        looks.append(_look(view, z, planes, parts))
         share = (_LOOK_SHARE - _PLANES_SHARE) * (index + 1) / len(views)
         on_progress(_PLANES_SHARE + share, _MESSAGE)
     walls = _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
     if not walls:
-        return list(maps)
+        return maps
     every, stands_on = _with_walls(planes, walls, float(np.median(depths)))
-    filled = []
-    for index, (look, found) in enumerate(zip(looks, maps, strict=True)):
-        filled.append(_laid(look, found.z, every, stands_on))
+    filled = shelves.scratch("on walls", len(views))
+    for index, (look, z) in enumerate(zip(looks, depths_of(maps), strict=True)):
+        filled[index] = _laid(look, z, every, stands_on)
         share = (_LAY_SHARE - _LOOK_SHARE) * (index + 1) / len(views)
         on_progress(_LOOK_SHARE + share, _MESSAGE)
-    seen = surface_points(views, [found.z for found in maps])
+    seen = surface_points(views, depths_of(maps))
     neighbours = choose_neighbours(views, seen, config.num_neighbours, config.best_angle_deg)
     laid = confirmed(
         views,
@@ -135,6 +143,8 @@ def stood_up(
         config,
         refutes,
         lambda done: on_progress(_LAY_SHARE + (_SPREAD_SHARE - _LAY_SHARE) * done, _MESSAGE),
+        engine,
+        MapShelf.kept(shelves, "walls", len(views), fresh=True),
     )
     return spread(
         looks,
@@ -144,6 +154,7 @@ def stood_up(
         neighbours,
         config,
         lambda done: on_progress(_SPREAD_SHARE + (1.0 - _SPREAD_SHARE) * done, _MESSAGE),
+        engine,
     )
 
 
@@ -165,8 +176,7 @@ def _floors(
     return found
 
 
-def _look(view: StereoView, z: Depths, planes: Floats) -> _Look:
-    patches = even_patches(view.picture)
+def _look(view: StereoView, z: Depths, planes: Floats, patches: Labels) -> _Look:
     known, usable = z > 0, view.picture >= 0.0
     num = int(patches.max()) + 1
     area = np.bincount(patches.ravel(), minlength=num)

@@ -22,6 +22,7 @@ from torch import Tensor
 from pipelines.nerf.data.depth_maps import DepthMaps, DepthSupervision
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.data.pixels import PixelSampler, block_side
+from pipelines.nerf.devices import choose_device
 from pipelines.nerf.engines.gpu.step import StepLosses
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.judging.metrics import psnr_from_mse
@@ -32,7 +33,6 @@ from pipelines.nerf.training.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.nerf.training.gpu_steps import EngineLost, GpuSteps, StepShape
 from pipelines.nerf.training.state import (
     TrainingState,
-    choose_device,
     initial_state,
     is_fast,
     learning_rates,

@@ -42,19 +42,6 @@ def learning_rates(rates: OptimizerConfig, step: int) -> dict[str, float]:
     }
 
 
-def choose_device(wanted: str) -> torch.device:
-    """The device for "auto", "cpu" or "cuda". Raises NerfError where CUDA is asked for in vain."""
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise NerfError(
-            "bad_config",
-            "The option train.device is 'cuda', and this machine has no usable GPU.",
-            "Set train.device to auto or cpu.",
-        )
-    if wanted == "auto":
-        wanted = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(wanted)
-
-
 @dataclass
 class TrainingState:
     """All that changes from step to step."""

@@ -92,7 +92,7 @@ def test_the_whole_way_is_gone_on_a_cpu(tmp_path: Path) -> None:
     answer = python(WHOLE_WAY, str(file), TRITON_INTERPRET="1")
     assert answer.returncode == 0, answer.stdout[-2000:] + answer.stderr[-3000:]
     values = json.loads(file.read_text())
-    assert len(values["checks"]) == 2 * 7 + 3 * 2 + 1
+    assert len(values["checks"]) == 2 * 7 + 3 * 2 + 3 + 1
     assert all(check["passed"] for check in values["checks"])
     assert [speed["way"] for speed in values["speeds"]] == 2 * ["graph", "eager", "plain"]
     assert set(values["ratios_to_plain"]) == {"graph", "eager"}

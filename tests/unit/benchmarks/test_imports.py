@@ -32,6 +32,7 @@ OF_THE_WHOLE_PRODUCT = (
     "scene_capture.py",
     "service_load.py",
     "stereo.py",
+    "stereo_memory.py",
     "tone_mapping.py",
     "turntable.py",
 )

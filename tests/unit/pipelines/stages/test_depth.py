@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from pipelines.errors import Cancelled, TrainingError
@@ -18,12 +19,14 @@ from pipelines.exports.options import CropShapeOptions
 from pipelines.exports.texture.photos import Photos
 from pipelines.manifest import RunHooks
 from pipelines.nerf.data.light import exposed
+from pipelines.nerf.stereo.engines import TorchEngine
 from pipelines.options import OptionsError, resolve_options
 from pipelines.sample.scene import depth_image, pose_matrix
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.depth_maps_file import INDEX, DepthMapsFile
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.stereo_views import undistorted_picture
+from pipelines.stages import depth
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -58,6 +61,25 @@ def test_maps_are_those_of_the_training_images_and_right(mapped: Workspace) -> N
     assert np.mean(shares) > 0.3
     assert np.median(np.concatenate(errors)) < 0.02
     assert (np.concatenate(errors) < 0.05).mean() > 0.8
+
+
+def test_a_device_with_pytorch_finds_the_same_as_the_kernels(
+    mapped: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a GPU runs, on the CPU: the whole stage."""
+    engine = TorchEngine(torch.device("cpu"))
+    monkeypatch.setattr(depth, "choose_engine", lambda views, config: engine)
+    workspace = tiny_job.make_capture(tmp_path / "job", num_images=24)
+    known_before, right_before = how_right(mapped)
+    summary = tiny_job.run(workspace, "depth", **STEREO)["summary"]
+    known, right = how_right(workspace)
+    assert known == pytest.approx(known_before, abs=0.005)
+    assert right == pytest.approx(right_before, abs=0.005)
+    for ours, theirs in zip(_all_depths(workspace), _all_depths(mapped), strict=True):
+        assert ((ours > 0) != (theirs > 0)).mean() < 0.01
+        both = (ours > 0) & (theirs > 0)
+        assert np.quantile(np.abs(ours[both] / theirs[both] - 1.0), 0.98) < 2e-3
+    assert summary["device"] == mapped.manifest("depth")["summary"]["device"] == "cpu"
 
 
 def test_plain_surfaces_are_completed(mapped: Workspace, tmp_path: Path) -> None:

@@ -37,6 +37,30 @@ def test_depths_are_where_the_surfaces_are(gain: float) -> None:
     assert np.median(error) < 0.005
 
 
+def test_pictures_held_upright_and_lying_are_compared() -> None:
+    """Every other picture is what a narrower, or a lower, one shows of the same."""
+    views, depths = row_of_cameras()
+    rows, columns = views[0].picture.shape
+    for k in range(len(views)):
+        if k % 2:
+            kept = slice(0, rows), slice(columns // 6, columns - columns // 6)
+        else:
+            kept = slice(rows // 8, rows - rows // 8), slice(0, columns)
+        fx, fy, cx, cy = views[k].lens
+        lens = (fx, fy, cx - kept[1].start, cy - kept[0].start)
+        picture = np.ascontiguousarray(views[k].picture[kept])
+        views[k] = StereoView(picture, lens, views[k].world_from_camera)
+        depths[k] = depths[k][kept]
+    assert len({view.picture.shape for view in views}) == 2
+    for known in (known_points(views, depths), None):
+        maps = find_depth_maps(views, CONFIG, known)
+        for k in (2, 3):
+            found = maps[k].z > 0
+            assert maps[k].z.shape == depths[k].shape
+            assert found.mean() > 0.7
+            assert np.mean(np.abs(maps[k].z / depths[k] - 1.0)[found] < 0.03) > 0.9
+
+
 def test_without_any_known_point_a_coarse_pass_finds_the_range() -> None:
     views, depths = row_of_cameras(9)
     maps = find_depth_maps(views, CONFIG)

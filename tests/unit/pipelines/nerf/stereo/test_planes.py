@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.nerf.stereo.maps import DepthMap, MapShelf
 from pipelines.nerf.stereo.planes import completed, find_planes
 from pipelines.nerf.stereo.views import StereoView
 from tests.unit.pipelines.nerf.stereo.painted_wall import BOX, SLOPE, WALL, row_of_cameras
@@ -59,7 +59,7 @@ def test_planes_of_the_scene_are_found_largest_first() -> None:
 def test_a_blank_patch_lies_on_the_plane_of_its_borders() -> None:
     views, depths, middles = blank_wall()
     maps = maps_without(depths, middles)
-    found = completed(views, maps, CONFIG)
+    found = completed(views, MapShelf.of(maps), CONFIG)
     for before, after, depth, middle in zip(maps, found, depths, middles, strict=True):
         assert middle.sum() > 100
         assert (after.z[middle] > 0).mean() > 0.9
@@ -76,7 +76,7 @@ def test_depths_near_their_plane_become_flat_and_others_stay() -> None:
     step = np.zeros(noise.shape, bool)
     step[60:68, 20:40] = True
     noisy = [np.where(step & (depth > 3.0), 0.97 * depth, depth) for depth in noisy]
-    found = completed(views, maps_without(noisy, middles), CONFIG)[3]
+    found = completed(views, MapShelf.of(maps_without(noisy, middles)), CONFIG)[3]
     patch = (views[3].picture == np.float32(0.9)) & ~step & ~middles[3]
     before = np.abs(noisy[3] / depths[3] - 1.0)[patch].mean()
     after = np.abs(found.z / depths[3] - 1.0)[patch].mean()
@@ -100,7 +100,7 @@ def test_what_no_plane_tells_stays_unknown(case: str) -> None:
     maps = maps_without(depths, middles)
     if case == "no votes":
         maps = [DepthMap(found.z, np.minimum(found.votes, 1)) for found in maps]
-    for after, middle in zip(completed(views, maps, CONFIG), middles, strict=True):
+    for after, middle in zip(completed(views, MapShelf.of(maps), CONFIG), middles, strict=True):
         assert (after.z[middle] > 0).mean() < 0.03
 
 
@@ -115,6 +115,6 @@ def test_a_patch_that_others_see_through_stays_unknown() -> None:
         )
         for k, (found, depth, middle) in enumerate(zip(maps, depths, middles, strict=True))
     ]
-    found = completed(views, seen, CONFIG)
+    found = completed(views, MapShelf.of(seen), CONFIG)
     assert (found[3].z[middles[3]] > 0).mean() < 0.1
-    assert (completed(views, maps, CONFIG)[3].z[middles[3]] > 0).mean() > 0.9
+    assert (completed(views, MapShelf.of(maps), CONFIG)[3].z[middles[3]] > 0).mean() > 0.9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.nerf.stereo.maps import DepthMap, MapShelf
 from pipelines.nerf.stereo.spreading import PlainPatches, refutes, spread
 from tests.unit.pipelines.nerf.stereo.blank_room import WALL, Seen, look, walk
 
@@ -29,7 +29,7 @@ def run(knowing: set[int], walls: np.ndarray = BACK, share: float = 1.0) -> list
     looks = [
         PlainPatches(one.view, (~one.on_floor).astype(np.int32), np.array([1])) for one in SEEN
     ]
-    return spread(looks, before, maps, walls, NEAR, CONFIG)
+    return list(spread(looks, before, MapShelf.of(maps), walls, NEAR, CONFIG))
 
 
 @pytest.mark.parametrize("knowing", [{0, 1, 2}, {5, 6, 7}, {0, 3, 7}])

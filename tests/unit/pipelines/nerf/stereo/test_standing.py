@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.nerf.stereo.maps import DepthMap, MapShelf
 from pipelines.nerf.stereo.standing import stood_up
 from tests.unit.pipelines.nerf.stereo.blank_room import WALL, Seen, look, walk
 
@@ -15,7 +15,8 @@ CONFIG = StereoConfig(num_neighbours=5)
 
 
 def stood(seen: list[Seen], maps: list[DepthMap] | None = None) -> list[DepthMap]:
-    return stood_up([one.view for one in seen], maps or [one.known() for one in seen], CONFIG)
+    before = MapShelf.of(maps or [one.known() for one in seen])
+    return list(stood_up([one.view for one in seen], before, CONFIG))
 
 
 def test_a_blank_wall_stands_where_the_floor_ends() -> None:
@@ -23,7 +24,7 @@ def test_a_blank_wall_stands_where_the_floor_ends() -> None:
     told: list[float] = []
     found = stood_up(
         [one.view for one in seen],
-        [one.known() for one in seen],
+        MapShelf.of([one.known() for one in seen]),
         CONFIG,
         lambda share, message: told.append(share),
     )
