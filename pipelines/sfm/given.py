@@ -359,14 +359,23 @@ def reach(given: Floats, refined: Refined) -> float:
 
 
 def suspects(fit: Fit | None) -> list[int]:
-    """Images whose matches contradict their poses far more than others' do."""
-    if fit is None or np.isnan(fit.of_image).all():
-        return []
-    usual = float(np.nanmedian(fit.of_image))
+    """Images whose matches contradict their poses far more than others' do.
+
+    One after the other, the worst first, and the others are judged without its pairs: whoever
+    looks at a picture that has another one's pose seems to lie, too.
+    """
+    found: list[int] = []
+    if fit is None or np.isnan(fit.of_image()).all():
+        return found
+    usual = float(np.nanmedian(fit.of_image()))
     if usual < _USUAL:
-        return []
-    with np.errstate(invalid="ignore"):
-        return [int(index) for index in np.flatnonzero(fit.of_image < _LOST * usual)]
+        return found
+    while True:
+        of_image = np.nan_to_num(fit.of_image(found), nan=np.inf)
+        worst = int(of_image.argmin())
+        if not of_image[worst] < _LOST * usual:
+            return sorted(found)
+        found.append(worst)
 
 
 def other_readings(poses: Floats) -> list[tuple[str, Floats]]:

@@ -9,7 +9,7 @@ Symbols: N images; poses [N, 3, 4] world_from_camera, OpenCV axes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from pipelines.sfm.agreement import NEAR, off_lines
 from pipelines.tools.colmap_rays import px_per_radian
 
 Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 Matches = Mapping[tuple[int, int], tuple[Floats, Floats]]
 
 FEWEST_MATCHES, FEWEST_PAIRS = 12, 3
@@ -34,14 +35,36 @@ _TELLING_PAIRS = 2
 class Fit:
     """error_px: the median over pairs of the median match. worst_px: that of the pair that nine in
     ten are better than. agreement: share of matches that the poses can be right about, mean over
-    pairs. of_image: [N], the same of each image's pairs, NaN of one that too few tell about."""
+    pairs. num_images: N. ends, shares, weights: the P pairs, [P, 2], the share of each, [P], and
+    how much it counts, [P]."""
 
     error_px: float
     worst_px: float
     agreement: float
-    num_pairs: int
     num_matches: int
-    of_image: Floats
+    num_images: int
+    ends: Ints
+    shares: Floats
+    weights: Floats
+
+    @property
+    def num_pairs(self) -> int:
+        return len(self.shares)
+
+    def of_image(self, without: Collection[int] = ()) -> Floats:
+        """The agreement of each image's own pairs, [N], NaN of one that too few tell about.
+
+        without: images whose pairs do not count: they would speak against their neighbours.
+        """
+        counted = ~np.isin(self.ends, list(without)).any(axis=1)
+        ends, weights = self.ends[counted].ravel(), np.repeat(self.weights[counted], 2)
+        shares = np.repeat(self.shares[counted], 2)
+        pairs = np.bincount(ends, minlength=self.num_images)
+        counts = np.bincount(ends, weights, self.num_images)
+        with np.errstate(invalid="ignore"):
+            of_image: Floats = np.bincount(ends, shares * weights, self.num_images) / counts
+        of_image[(pairs < _TELLING_PAIRS) | (counts < _FULL_WEIGHT)] = np.nan
+        return of_image
 
     def as_dict(self) -> dict[str, Any]:
         """As report.json has it."""
@@ -61,9 +84,7 @@ def fit_of(
 
     long_side_px: at which features were found, at most.
     """
-    num = len(poses)
-    medians, shares, weights = [], [], []
-    sums, counts, pairs_of = np.zeros(num), np.zeros(num), np.zeros(num, np.int64)
+    medians, ends, shares, weights = [], [], [], []
     total = 0
     for (i, j), places in matches.items():
         if len(places[0]) < FEWEST_MATCHES:
@@ -72,28 +93,22 @@ def fit_of(
         off_rad, is_before = off_lines((poses[i], poses[j]), both, places)
         off_rad = np.nan_to_num(off_rad, nan=np.pi, posinf=np.pi)
         near_rad = NEAR * min(np.hypot(o.width, o.height) / px_per_radian(o) for o in both)
-        share = float(((off_rad <= near_rad) & is_before).mean())
-        weight = min(len(off_rad), _FULL_WEIGHT)
         medians.append(float(np.median(off_rad)) * px_scale(both, long_side_px))
-        shares.append(share)
-        weights.append(weight)
+        ends.append((i, j))
+        shares.append(float(((off_rad <= near_rad) & is_before).mean()))
+        weights.append(min(len(off_rad), _FULL_WEIGHT))
         total += len(off_rad)
-        for index in (i, j):
-            sums[index] += share * weight
-            counts[index] += weight
-            pairs_of[index] += 1
     if len(medians) < FEWEST_PAIRS:
         return None
-    with np.errstate(invalid="ignore"):
-        of_image = sums / counts
-    of_image[(pairs_of < _TELLING_PAIRS) | (counts < _FULL_WEIGHT)] = np.nan
     return Fit(
         error_px=float(np.median(medians)),
         worst_px=float(np.quantile(medians, 0.9)),
         agreement=float(np.average(shares, weights=weights)),
-        num_pairs=len(medians),
         num_matches=total,
-        of_image=of_image,
+        num_images=len(poses),
+        ends=np.array(ends, np.int64),
+        shares=np.array(shares),
+        weights=np.array(weights, np.float64),
     )
 
 

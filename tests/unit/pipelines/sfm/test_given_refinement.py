@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipelines.scene.cameras_file import Intrinsics
+from pipelines.sfm.given import suspects
 from pipelines.sfm.given_fit import fit_of
 from pipelines.sfm.given_pairs import overlapping_pairs, sampled_pairs
 from pipelines.sfm.given_refinement import carried, onto, refine, settled, shared, tolerances
@@ -143,8 +144,29 @@ def test_fit_counts_pixels_as_they_are_looked_at_and_names_the_wrong_image() -> 
     wrong[4, :, :3] = Rotation.from_rotvec((0.1, 0, 0)).as_matrix() @ wrong[4, :, :3]
     found = fit_of(wrong, lenses, matches, 960)
     assert found is not None
-    assert found.of_image.argmin() == 4
+    assert found.of_image().argmin() == 4
     assert fit_of(POSES, lenses, dict(list(matches.items())[:2]), 960) is None
+
+
+def test_who_mostly_looks_at_pictures_with_wrong_poses_is_not_named_with_them() -> None:
+    poses = path(8)
+    pixels, _ = seen_points(poses, POINTS)
+    wrong = poses.copy()
+    turned = Rotation.from_rotvec((0.15, 0, 0)).as_matrix()
+    wrong[[1, 4], :, :3] = turned @ wrong[[1, 4], :, :3]
+    wrong[[1, 4], :, 3] += (0.0, 0.5, 0.3)
+    good = [(0, 2), (0, 5), (2, 5), (2, 6), (5, 6), (6, 7), (5, 7), (0, 7), (3, 5), (3, 7)]
+    # Four in five of 3's matches are with 1 and 4.
+    bad = [(1, 3), (3, 4), (0, 1), (4, 5)]
+    few = slice(0, 15)
+    matches = {pair: (pixels[pair[0]], pixels[pair[1]]) for pair in good + bad}
+    for pair in [(3, 5), (3, 7)]:
+        matches[pair] = (pixels[pair[0]][few], pixels[pair[1]][few])
+    fit = fit_of(wrong, [LENS] * 8, matches, 960)
+    assert fit is not None
+    assert fit.of_image()[3] < 0.5 * np.nanmedian(fit.of_image())
+    assert suspects(fit) == [1, 4]
+    assert suspects(fit_of(poses, [LENS] * 8, matches, 960)) == []
 
 
 def test_tolerance_goes_down_to_that_of_right_poses() -> None:

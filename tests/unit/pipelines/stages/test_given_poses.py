@@ -160,7 +160,9 @@ def test_drifted_poses_are_refined_towards_the_truth_at_their_own_place_and_scal
     assert told["refinement"]["num_carried"] == 0
     assert told["refinement"]["replaced"] == []
     assert steps == sorted(steps)
-    assert len(set(steps)) > 10
+    # Those of the adjustment; how many there are before depends on how fast the machine matches.
+    assert len({step for step in steps if step > 0.8}) > 5
+    assert {0.18, 0.3, 0.8} <= {round(step, 3) for step in steps}
     assert (ctx.out / "points.ply").is_file()
 
 
