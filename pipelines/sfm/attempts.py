@@ -49,6 +49,7 @@ from pipelines.tools.colmap import (
     Watch,
     extraction_threads,
 )
+from pipelines.tools.colmap_placing import num_tidying_steps
 from pipelines.tools.colmap_results import PairStatistics, best_model
 
 NUM_PROBES = 5
@@ -67,8 +68,11 @@ _FIRST, _LAST = 0.9, 0.97
 """Where in the stage's progress the first rung ends, and the last."""
 _FOUND, _MATCHED = 0.28, 0.56
 """Where in a rung's part of it the features are found, and the pairs matched."""
-_CHOSEN, _PLACED = 0.05, 0.96
-"""Where between those two key frames are chosen, and where in the rest all images are placed."""
+_CHOSEN, _MAPPED, _TIDIED, _PLACED = 0.05, 0.4, 0.8, 0.96
+"""Where between those two key frames are chosen, where in the rest they are mapped, where between
+that and the fourth all images are placed, and where in the rest the model is complete."""
+_LONG_ITEM_S, _SILENT_AFTER_S = 10.0, 60.0
+"""After which one item counts as half done while its end is not known, and as no more done."""
 
 KEY_FRAMES = "key frames"
 """The matcher of a film that is mapped by some of its frames."""
@@ -143,18 +147,30 @@ class ProgressScale:
         self.expected_end = None
 
     def watch(self, span: Span, total: int, message: str) -> Watch:
-        """A watch that maps 0..total onto `span`."""
+        """A watch that maps 0..total onto `span`.
+
+        While one item takes long, it goes on by a part of that one, always more and never all;
+        after a minute it stands still, so that who looks for stages that hang sees it.
+        """
         start, end = span
+        last, since = -1, 0.0
 
         def report(done: int) -> None:
+            nonlocal last, since
             done = min(done, total)
-            fraction = start + (end - start) * done / max(total, 1)
-            began, first = self.anchor
             now = time.monotonic()
+            is_next = done != last
+            if is_next:
+                last, since = done, now
+            waited = min(now - since, _SILENT_AFTER_S)
+            part = waited / (waited + _LONG_ITEM_S)
+            fraction = start + (end - start) * min(done + part, total) / max(total, 1)
             if fraction > self.fraction:
                 self.fraction = fraction
-                pace = (now - began) / (fraction - first)
-                self.expected_end = now + pace * max(self.goal - fraction, 0.0)
+                if is_next:  # a part of one is a guess, which says nothing of the pace
+                    began, first = self.anchor
+                    pace = (now - began) / (fraction - first)
+                    self.expected_end = now + pace * max(self.goal - fraction, 0.0)
             left = None if self.expected_end is None else max(self.expected_end - now, 0.0)
             self.ctx.progress(self.fraction, f"{message} {done} of {total}", left)
 
@@ -387,12 +403,20 @@ class Ladder:
         num = len(self._source.files)
         settings = replace(rung.mapper, refine_principal_point=self._options.refine_principal_point)
         placed = span[0] + _PLACED * (span[1] - span[0])
-        watch = self._progress.watch((span[0], placed), num, "placing image")
+        mapped = span[0] + _MAPPED * (span[1] - span[0]) if keys else placed
+        counted = (len(keys), "placing key frame") if keys else (num, "placing image")
+        watch = self._progress.watch((span[0], mapped), *counted)
         models = self._reconstructor.map(settings, watch, keys)
         most = best_model(models)
         if keys and most is not None and len(most.indices) >= _ENOUGH_KEYS * len(keys):
+            all_placed = mapped + _TIDIED * (placed - mapped)
+            watch = self._progress.watch((mapped, all_placed), num, "placing image")
+            steps = num_tidying_steps(num)
+            tidied = self._progress.watch((all_placed, placed), steps, "tidying the model, step")
             models = [
-                self._reconstructor.place(model, settings, watch) if model is most else model
+                self._reconstructor.place(model, settings, watch, tidied)
+                if model is most
+                else model
                 for model in models
             ]
         compared = self._progress.watch((placed, span[1]), 3, "comparing poses with matches, part")

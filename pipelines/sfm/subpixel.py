@@ -100,7 +100,7 @@ def refine_model(
     tracks = reconstructor.stored_tracks(
         model, lambda rounds: report(0.5 + 0.5 * share_done(rounds))
     )
-    report(0.05)
+    report(0.02)
     refined = None
     if options.subpixel and not source.has_panoramas:
         refined = refine_keypoints(
@@ -133,6 +133,7 @@ def refine_keypoints(
     """
     before = tracks.error_px
     pairs = tracks.pairs()
+    report(0.0)
     xy, alike = find_again(
         pairs, pictures, tracks.sizes, report, long_side_px=long_side_px, num_threads=num_threads
     )

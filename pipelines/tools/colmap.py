@@ -33,7 +33,7 @@ from PIL import Image
 from pipelines.errors import ToolError
 from pipelines.tools.colmap_adjustment import Run
 from pipelines.tools.colmap_lenses import LensTrials
-from pipelines.tools.colmap_placing import place_others
+from pipelines.tools.colmap_placing import num_tidying_steps, place_others
 from pipelines.tools.colmap_probing import MatchedPairs, set_lens, start_focal
 from pipelines.tools.colmap_results import (
     Correspondences,
@@ -293,10 +293,13 @@ class Reconstructor:
             if model.num_reg_images() > 1
         ]
 
-    def place(self, model: SparseModel, settings: MapperSettings, watch: Watch) -> SparseModel:
+    def place(
+        self, model: SparseModel, settings: MapperSettings, watch: Watch, tidied: Watch
+    ) -> SparseModel:
         """A model that `map` found with all other images that can be placed on it, not adjusted.
 
-        watch: receives the number of images placed so far.
+        watch: receives the number of images placed so far. tidied: then the steps that are done, of
+        `num_tidying_steps`.
         """
         if model.stored is None:
             raise ValueError("the model was not written by COLMAP")
@@ -307,9 +310,14 @@ class Reconstructor:
             self._mapping_options(settings),
             links=self.links,
             placed=watch,
+            tidied=tidied,
         )
         found.write(whole)
-        return sparse_model(found, whole)
+        steps = num_tidying_steps(len(self.names))
+        tidied(steps - 1)
+        read = sparse_model(found, whole)
+        tidied(steps)
+        return read
 
     def lens_trials(
         self, model: SparseModel, watch: Watch, *, refine_principal_point: bool

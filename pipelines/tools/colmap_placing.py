@@ -27,11 +27,13 @@ def place_others(
     *,
     links: Path,
     placed: Callable[[int], None],
+    tidied: Callable[[int], None],
 ) -> Any:
     """The model in `folder` with all images of the database that can be placed on it, as they were.
 
     options: `pycolmap.IncrementalPipelineOptions`. links: folder of the images. placed: called
-    after each image with the number that the model holds now; what it raises ends the call.
+    after each image with the number that the model holds now. tidied: called afterwards with the
+    steps that are done, less than `num_tidying_steps`. What these raise ends the call.
     Returns a `pycolmap.Reconstruction`.
     """
     wanted = pycolmap.DatabaseCacheOptions()
@@ -46,26 +48,37 @@ def place_others(
         _register(mapper, model, options, placed)
     finally:
         mapper.end_reconstruction(False)
-    _thin(model, mapped, options.random_seed, placed)
+    num = len(model.images)
+    _thin(model, mapped, options.random_seed, tidied)
+    tidied(num)
     limits = options.get_mapper()
     pycolmap.ObservationManager(model).filter_all_points3D(
         limits.filter_max_reproj_error, limits.filter_min_tri_angle
     )
-    _color(model, links, placed)
+    tidied(num + 1)
+    _color(model, links, lambda done: tidied(num + 1 + done))
+    tidied(2 * num + 1)
     model.update_point_3d_errors()
+    tidied(2 * num + 2)
     return model
 
 
-def _thin(model: Any, mapped: frozenset[int], seed: int, placed: Callable[[int], None]) -> None:
+def num_tidying_steps(num_images: int) -> int:
+    """Steps after the last image is placed, of which the last two are left to who asked for it: to
+    write the model, and to read it."""
+    return 2 * num_images + 4
+
+
+def _thin(model: Any, mapped: frozenset[int], seed: int, tidied: Callable[[int], None]) -> None:
     """Leave some observations of each image that was not mapped."""
     random = np.random.default_rng(seed)
     image_ids = sorted(set(model.reg_image_ids()) - mapped)
     left = min(max(IN_ALL // max(len(image_ids), 1), FEWEST), MOST)
-    for image_id in image_ids:
+    for done, image_id in enumerate(image_ids):
         seen = model.image(image_id).get_observation_point2D_idxs()
         for index in random.permutation(seen)[left:].tolist():
             model.delete_observation(image_id, index)
-        placed(model.num_reg_images())
+        tidied(done)
 
 
 def _register(mapper: Any, model: Any, options: Any, placed: Callable[[int], None]) -> None:
@@ -85,14 +98,14 @@ def _register(mapper: Any, model: Any, options: Any, placed: Callable[[int], Non
         left = refused
 
 
-def _color(model: Any, links: Path, placed: Callable[[int], None]) -> None:
+def _color(model: Any, links: Path, tidied: Callable[[int], None]) -> None:
     """Give points that are new since mapping, which are black, the colour that an image shows."""
     black = {i for i, point in model.points3D.items() if not point.color.any()}
-    for image_id in sorted(model.reg_image_ids()):
+    for done, image_id in enumerate(sorted(model.reg_image_ids())):
         if not black:
             break
         seen = {point.point3D_id for point in model.image(image_id).get_observation_points2D()}
         if black & seen:
             model.extract_colors_for_image(image_id, links)
             black -= seen
-        placed(model.num_reg_images())
+        tidied(done)

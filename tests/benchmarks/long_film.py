@@ -1,13 +1,14 @@
 """Time, memory and steadiness of progress of a long film's first stages.
 
     python -m tests.benchmarks.long_film FILM.mp4 [--frames 1000] [--preset preview]
-        [--stages frames,poses] [--json out/long.json]
+        [--stages frames,poses] [--truth TRUTH.json] [--json out/long.json]
 
 A film of 1,000 frames is made with `python -m pipelines.sample FILM.mp4 --frames 1000 --long-side
-1920`. `frames` keeps as many as are asked for, `poses` finds theirs. Each stage is a process of its
-own. Stated are its seconds, the most memory that it held, the most that one program it started held
-(ffmpeg; both by the kernel's own account), and the longest time between two moves of its progress:
-of the fraction, and of anything it says (fraction, words or seconds left).
+1920 --truth TRUTH.json`. `frames` keeps as many as are asked for, `poses` finds theirs. Each stage
+is a process of its own. Stated are its seconds, the most memory that it held, the most that one
+program it started held (ffmpeg; both by the kernel's own account), and the longest time between two
+moves of its progress: of the fraction, and of anything it says (fraction, words or seconds left).
+With the true cameras, also how far the poses are from them.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from pathlib import Path
 from pipelines.manifest import RunHooks, run_stage
 from pipelines.options import resolve_options
 from pipelines.registry import get_stage
+from pipelines.sample.judge import PosesJudgement, judge_poses
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
 from tests.benchmarks.machine import describe, heading, peak_memory_bytes
 from tests.benchmarks.tables import markdown_table, number, write_json
@@ -106,6 +109,12 @@ def measure_apart(stage: str, job: Path, preset: str, num_frames: int) -> Measur
     return Measured(**json.loads(done.stdout.splitlines()[-1]))
 
 
+def judge(job: Path, truth: Path) -> PosesJudgement:
+    """The poses of a job beside the film's true ones."""
+    found = CamerasFile.load(Workspace(job).stage("poses") / "cameras.json")
+    return judge_poses(found, CamerasFile.load(truth))
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -113,6 +122,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--preset", default="preview")
     parser.add_argument("--stages", default="frames,poses")
+    parser.add_argument("--truth", type=Path, help="the film's true cameras")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--here", help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -130,6 +140,7 @@ def main() -> None:
         for stage in ("ingest", *given.stages.split(",")):
             rows.append(measure_apart(stage, job, given.preset, given.frames))
             print(asdict(rows[-1]), file=sys.stderr)
+        judged = None if given.truth is None else judge(job, given.truth)
     header = ("stage", "s", "peak, MiB", "ffmpeg's, MiB", "longest pause, s", "silence, s")
     table = [
         (
@@ -143,6 +154,11 @@ def main() -> None:
         for row in rows
     ]
     print(markdown_table(header, table))
+    if judged is not None:
+        print(
+            f"{judged.num_images} poses: rotations {judged.mean_rotation_error_deg:.3f} degrees, "
+            f"centres {judged.mean_center_error:.3%} of the path's extent (means)"
+        )
     write_json(given.json, {"machine": machine, "stages": [asdict(row) for row in rows]})
 
 
