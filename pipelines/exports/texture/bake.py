@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,16 +121,16 @@ def texture_from_photos(
         lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
     )
     added = levels(charts, colors, _moving(on_progress, _COPY_SHARE, _LEVEL_SHARE, _MOST_POLLS))
-    own = mesh.colors[charts.vertex]
+    own: NDArray[np.floating[Any]] = mesh.colors
     calls = layout.side // ROWS + 4 * _SPREAD_PX
     told = _moving(on_progress, _LEVEL_SHARE, _ADD_SHARE, calls)
     covered = _level(picture, charts, layout, added, told)
     if refined:
-        refine(
-            *(picture, covered, surface, charts, layout, photos),
+        own = refine(
+            *(picture, covered, own, surface, charts, layout, photos),
             lambda done: on_progress(_ADD_SHARE + (1.0 - _ADD_SHARE) * done),
         )
-    _fill_cells(picture, charts, layout, own)
+    _fill_cells(picture, charts, layout, own[charts.vertex])
     on_progress(1.0)
     return TexturedMesh(
         vertices=mesh.vertices[charts.vertex],
@@ -208,7 +209,9 @@ def _level(
     return covered
 
 
-def _fill_cells(picture: Bytes, charts: Charts, layout: Layout, colors: Floats) -> None:
+def _fill_cells(
+    picture: Bytes, charts: Charts, layout: Layout, colors: NDArray[np.floating[Any]]
+) -> None:
     """Gradients between the corners' own colours [U, 3], for faces that no photo shows."""
     alone = np.flatnonzero(charts.photo[charts.face_chart] == NOBODY)
     if len(alone) == 0:

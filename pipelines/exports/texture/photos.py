@@ -83,16 +83,18 @@ class Photos:
         whole = int(self._cameras.model[index]) == EQUIRECTANGULAR
         return angle * math.pi if whole else angle
 
-    def glance_size(self, index: int) -> tuple[int, int]:
+    def glance_size(self, index: int, side: int = _GLANCE_SIDE) -> tuple[int, int]:
         """Width and height of what `glance` gives."""
         width, height = self.size(index)
-        shrink = min(1.0, _GLANCE_SIDE / max(width, height))
+        shrink = min(1.0, side / max(width, height))
         return max(1, round(width * shrink)), max(1, round(height * shrink))
 
-    def glance(self, index: int) -> tuple[Image.Image, NDArray[np.float64]]:
-        """The photo, RGB, at most 640 px long, and its size as a share [2] of the whole one's."""
+    def glance(
+        self, index: int, side: int = _GLANCE_SIDE
+    ) -> tuple[Image.Image, NDArray[np.float64]]:
+        """The photo, RGB, at most `side` px long, and its size as a share [2] of the whole's."""
         width, height = self.size(index)
-        small = self.glance_size(index)
+        small = self.glance_size(index, side)
         with Image.open(self._root / self._images[index].file) as opened:
             opened.draft("RGB", small)
             glance = opened.convert("RGB").resize(small, Image.Resampling.BOX)

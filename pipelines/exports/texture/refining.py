@@ -13,10 +13,14 @@ Pixels far from what the others agree on, as a passer-by's, count less (Huber, "
 a location parameter", 1964). Solved by a few rounds of SIRT (Gilbert 1972): each texel moves by the
 mean of what the pixels that see it miss, which from a good beginning needs few.
 
-Left out are pixels at jumps of depth and at holes, where a pose that is off shows something else,
-masked ones, what is seen from behind or at a glance, and faces that no photo shows whole.
+Faces that no photo shows whole have no patch, but their vertices' colours; these get their step
+from the pixels that show a part of such a face, in the same way.
 
-Symbols: N pixels, S side of the texture, M texels of all the copies, one row after another.
+Left out are pixels at jumps of depth and at holes, where a pose that is off shows something else,
+masked ones, and what is seen from behind or at a glance.
+
+Symbols: N pixels, S side of the texture, M texels of all the copies, one row after another; V
+vertices.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +42,7 @@ from pipelines.exports.texture.texels import spread
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-_ROUNDS = 3
+_ROUNDS, _VERTEX_ROUNDS = 3, 12
 _FAR_OFF = 0.06
 """A pixel that is farther off, root mean square of its channels, counts as if it were so far."""
 _KEEP = 0.05
@@ -47,6 +52,8 @@ _JUMP = 0.03
 _COPIES = 3
 """Copies of the texture, of a half, a quarter and an eighth of its side."""
 _LEAST_SIDE = 1 << (_COPIES + 1)
+_SIDE = 960
+"""Of the photos as they are looked at, px at most."""
 _PIXELS = 16_000_000
 """Looked at in all, at some 40 bytes each; of more an even choice."""
 _CHUNK = 2_000_000
@@ -57,7 +64,8 @@ _LOOK_SHARE, _MARGIN_SHARE, _SOLVE_SHARE, _SPREAD_SHARE = 0.5, 0.55, 0.95, 0.99
 
 @dataclass(frozen=True)
 class _Looks:
-    """Some pixels of the photos. seen: [N, M], texels as each pixel mixes them. color: [N, 3]."""
+    """Some pixels of the photos. seen: [N, M or V], texels or vertices as each pixel mixes them.
+    color: [N, 3]."""
 
     seen: csr_array
     color: Bytes
@@ -66,22 +74,38 @@ class _Looks:
 def refine(
     picture: Bytes,
     covered: NDArray[np.bool_],
+    colors: NDArray[np.floating[Any]],
     surface: Surface,
     charts: Charts,
     layout: Layout,
     photos: Photos,
     on_progress: Callable[[float], None] = lambda done: None,
-) -> None:
-    """Move a texture [S, S, 3] towards what the photos show, in place.
+) -> Floats:
+    """Move a texture [S, S, 3] towards what the photos show, in place; and vertices' colours
+    [V, 3] in [0, 1] where faces have nothing else: returned.
 
     covered: [S, S], texels on faces that a photo shows; changed. surface: whose faces are those of
     the charts, in order. on_progress: told the share that is done; may raise.
     """
-    if layout.side < _LEAST_SIDE or not (charts.photo != NOBODY).any():
-        return
-    looks = _looks(surface, charts, layout, photos, lambda done: on_progress(_LOOK_SHARE * done))
-    if not looks:
-        return
+    if layout.side < _LEAST_SIDE:
+        return colors.astype(np.float32)
+    of_texels, of_vertices = _looks(
+        surface, charts, layout, photos, lambda done: on_progress(_LOOK_SHARE * done)
+    )
+    if of_texels:
+        _refine_picture(picture, covered, of_texels, charts, layout, on_progress)
+    return refined_colors(colors.astype(np.float32), [(x.seen, x.color) for x in of_vertices])
+
+
+def _refine_picture(
+    picture: Bytes,
+    covered: NDArray[np.bool_],
+    looks: list[_Looks],
+    charts: Charts,
+    layout: Layout,
+    on_progress: Callable[[float], None],
+) -> None:
+    """Move the texture. looks: emptied, as they are large."""
     # What a patch shows around its faces may lie behind them: at a pixel that mixes both, the face
     # would make up for it.
     told = _moving(on_progress, _LOOK_SHARE, _MARGIN_SHARE, 4 * MARGIN_PX)
@@ -96,7 +120,8 @@ def refine(
         [(look.seen, look.color) for look in looks],
         lambda done: on_progress(_MARGIN_SHARE + (_SOLVE_SHARE - _MARGIN_SHARE) * done),
     )
-    del looks, begun
+    looks.clear()
+    del begun
     told = _moving(on_progress, _SOLVE_SHARE, _SPREAD_SHARE, 4 * _SPREAD_PASSES)
     spread(step, known, _SPREAD_PASSES, told)
     _add(picture, step, _last_row(charts, layout))
@@ -127,16 +152,38 @@ def solved(
         texels = copies_of(texture)
         missed = np.zeros((len(texels), 4), np.float32)
         for done, (seen, color) in enumerate(looks):
-            off = color.astype(np.float32) / np.float32(255.0) - seen @ texels
-            size = np.sqrt(np.square(off).mean(axis=1))
-            weight = np.float32(_FAR_OFF) / np.maximum(size, np.float32(_FAR_OFF))
-            missed += seen.T @ np.column_stack([weight[:, None] * off, weight])
+            missed += _missed(seen, color, texels)
             on_progress((turn + (done + 1) / len(looks)) / _ROUNDS)
         mean = _gathered(missed, side)
         held = mean[..., :3] + np.float32(_KEEP) * (begun - texture)
         texture += held / (mean[..., 3:] + np.float32(_KEEP))
         known |= mean[..., 3] > 0.0
     return texture - begun, known
+
+
+def refined_colors(begun: Floats, looks: list[tuple[csr_array, Bytes]]) -> Floats:
+    """Vertices' colours [V, 3] in [0, 1], moved towards what pixels show.
+
+    looks: as those of `solved`, of vertices instead of texels: matrices [N, V].
+    """
+    colors = begun.copy()
+    for _ in range(_VERTEX_ROUNDS if looks else 0):
+        missed = np.zeros((len(colors), 4), np.float32)
+        for seen, color in looks:
+            missed += _missed(seen, color, colors)
+        held = missed[:, :3] + np.float32(_KEEP) * (begun - colors)
+        colors += held / (missed[:, 3:] + np.float32(_KEEP))
+    return colors
+
+
+def _missed(seen: csr_array, color: Bytes, texels: Floats) -> Floats:
+    """By how much pixels [N, 3] are missed, summed over those that see each texel, and how much
+    they count in all, [M, 4]."""
+    off = color.astype(np.float32) / np.float32(255.0) - seen @ texels
+    size = np.sqrt(np.square(off).mean(axis=1))
+    weight = np.float32(_FAR_OFF) / np.maximum(size, np.float32(_FAR_OFF))
+    sums: Floats = seen.T @ np.column_stack([weight[:, None] * off, weight])
+    return sums
 
 
 def copies_of(texture: Floats) -> Floats:
@@ -178,42 +225,72 @@ def _looks(
     layout: Layout,
     photos: Photos,
     on_progress: Callable[[float], None],
-) -> list[_Looks]:
-    """What the photos see of the texture, some photos at a time."""
+) -> tuple[list[_Looks], list[_Looks]]:
+    """What the photos see of the texture, and of vertices of faces without a photo, some photos at
+    a time."""
     density = _density(surface, charts, layout)
     painted = charts.photo[charts.face_chart] != NOBODY
-    sizes = [photos.glance_size(index) for index in range(len(photos))]
+    sizes = [photos.glance_size(index, _SIDE) for index in range(len(photos))]
     stride = max(1, -(-sum(width * height for width, height in sizes) // _PIXELS))
-    looks: list[_Looks] = []
-    waiting: list[tuple[NDArray[np.float64], NDArray[np.int64], Bytes]] = []
+    texels = _Waiting(lambda places, level: mixing(places, level, layout.side // 2))
+    vertices = _Waiting(lambda which, weights: _of_corners(which, weights, len(surface.vertices)))
     for index in range(len(photos)):
-        glance, share = photos.glance(index)
+        glance, share = photos.glance(index, _SIDE)
         width, height = glance.size
         kept, distance, face, weights = _met(surface, photos, index, (width, height), share)
         chosen = np.zeros(len(kept), np.bool_)
         chosen[index % stride :: stride] = True
         kept &= chosen
-        kept[kept] = painted[face[kept]]
         if kept.any():
             rows, columns = np.divmod(np.flatnonzero(kept), width)
             pixels = (np.stack([columns, rows], axis=1) + 0.5) / share
-            mask = photos.usable(index, pixels)
-            kept[kept] = mask
-            face, distance = face[kept], distance[kept]
-            corners = layout.uv[charts.faces[face]]
-            places = np.einsum("nc,ncd->nd", weights[kept], corners)
-            angle = photos.pixel_angle(index) / share.mean()
-            texels = np.maximum(density[face] * distance * angle, 1.0)
-            level = np.clip(np.rint(np.log2(texels)).astype(np.int64), 1, _COPIES) - 1
-            color = np.asarray(glance).reshape(-1, 3)[kept]
-            waiting.append((0.5 * places, level, color))
-        last = index + 1 == len(photos)
-        if waiting and (last or sum(len(level) for _, level, _ in waiting) >= _CHUNK):
-            places, level, color = (np.concatenate(part) for part in zip(*waiting, strict=True))
-            looks.append(_Looks(mixing(places, level, layout.side // 2), color))
-            waiting = []
+            kept[kept] = photos.usable(index, pixels)
+        colors = np.asarray(glance).reshape(-1, 3)
+        alone = kept & ~painted[face]
+        vertices.add(surface.faces[face[alone]], weights[alone], colors[alone])
+        kept &= painted[face]
+        face, distance = face[kept], distance[kept]
+        places = np.einsum("nc,ncd->nd", weights[kept], layout.uv[charts.faces[face]])
+        angle = photos.pixel_angle(index) / share.mean()
+        wanted = np.maximum(density[face] * distance * angle, 1.0)
+        level = np.clip(np.rint(np.log2(wanted)).astype(np.int64), 1, _COPIES) - 1
+        texels.add(0.5 * places, level, colors[kept])
         on_progress((index + 1) / len(photos))
-    return looks
+    return texels.all(), vertices.all()
+
+
+class _Waiting:
+    """Pixels of photos until there are enough of them for one matrix."""
+
+    def __init__(self, matrix: Callable[[Any, Any], csr_array]) -> None:
+        self._matrix = matrix
+        self._parts: list[tuple[NDArray[Any], NDArray[Any], Bytes]] = []
+        self._looks: list[_Looks] = []
+
+    def add(self, first: NDArray[Any], second: NDArray[Any], color: Bytes) -> None:
+        """Some pixels: what the matrix is made of, and their colours."""
+        if len(color):
+            self._parts.append((first, second, color))
+        if sum(len(part[2]) for part in self._parts) >= _CHUNK:
+            self._join()
+
+    def all(self) -> list[_Looks]:
+        """All that came in."""
+        if self._parts:
+            self._join()
+        return self._looks
+
+    def _join(self) -> None:
+        first, second, color = (np.concatenate(part) for part in zip(*self._parts, strict=True))
+        self._looks.append(_Looks(self._matrix(first, second), color))
+        self._parts = []
+
+
+def _of_corners(vertices: NDArray[np.int32], weights: Floats, num_vertices: int) -> csr_array:
+    """Pixels as mixtures of three vertices each, [N, V]. vertices, weights: [N, 3]."""
+    ends = np.arange(0, 3 * len(vertices) + 1, 3, dtype=np.int32)
+    values = weights.astype(np.float32).reshape(-1)
+    return csr_array((values, vertices.reshape(-1), ends), shape=(len(vertices), num_vertices))
 
 
 def _met(

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from pipelines.errors import Cancelled
 from pipelines.exports.mesh import Floats, TexturedMesh
-from pipelines.exports.texture import refining
+from pipelines.exports.texture import bake, refining
 from pipelines.exports.texture.bake import texture_from_photos
-from pipelines.exports.texture.refining import copies_of, mixing, solved
+from pipelines.exports.texture.choice import NOBODY, choose_photos
+from pipelines.exports.texture.refining import copies_of, mixing, refined_colors, solved
 from pipelines.judging.asset_views import Texture
 from pipelines.scene.picture_sampling import between_pixels
 from tests.unit.pipelines.exports.texture import painted_ball
@@ -119,6 +123,43 @@ def test_where_photos_contradict_each_other_the_texture_is_nearer_to_the_truth(
     assert np.square(off_by(all_of_them)).mean() < 0.6 * np.square(off_by(one)).mean()
     again = texture_from_photos(painted_ball.ball(), photos, 1024)
     assert (again.texture == all_of_them.texture).all(), "the same bytes each time"
+
+
+def test_vertices_of_faces_without_a_photo_go_towards_what_photos_show_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    photos = painted_ball.photos_of(tmp_path, images)
+    ball = painted_ball.ball()
+    grey = replace(ball, colors=np.full_like(ball.colors, 0.5))
+    alone = np.arange(len(ball.faces)) % 3 == 0
+
+    def without_a_third(*given: Any) -> NDArray[np.int32]:
+        return np.where(alone, NOBODY, choose_photos(*given)).astype(np.int32)
+
+    monkeypatch.setattr(bake, "choose_photos", without_a_third)
+    faces = np.repeat(alone, 4)
+    as_they_were = texture_from_photos(grey, photos, 1024, refined=False)
+    moved = texture_from_photos(grey, photos, 1024)
+    before, after = (np.square(off_by(of)[faces]).mean() for of in (as_they_were, moved))
+    assert after < 0.25 * before
+    # And as good as vertices can be: those of the truth.
+    ends = ball.vertices - CENTER
+    truth = stripes(CENTER + ends / np.linalg.norm(ends, axis=1, keepdims=True))
+    best = texture_from_photos(replace(ball, colors=truth), photos, 1024, refined=False)
+    assert after < 1.2 * np.square(off_by(best)[faces]).mean()
+
+
+def test_a_vertex_that_no_pixel_sees_keeps_its_colour() -> None:
+    random = np.random.default_rng(4)
+    weights = random.dirichlet(np.ones(3), 500).astype(np.float32)
+    corners = np.tile(np.array([0, 1, 2], np.int32), (500, 1))
+    truth = np.array([[0.2, 0.4, 0.6], [0.5, 0.5, 0.5], [0.7, 0.3, 0.4], [0.9, 0.9, 0.9]])
+    color = np.rint(255.0 * (weights @ truth[:3])).astype(np.uint8)
+    begun = np.clip(truth + 0.05, 0.0, 1.0).astype(np.float32)
+    found = refined_colors(begun, [(refining._of_corners(corners, weights, 4), color)])
+    assert np.abs(found[:3] - truth[:3]).max() < 0.01
+    assert (found[3] == begun[3]).all()
 
 
 def test_a_passer_by_in_a_photo_stays_out(tmp_path: Path) -> None:
