@@ -8,7 +8,6 @@ keep their vertices' colours. Memory: one photo at a time and the picture itself
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,7 +23,7 @@ from pipelines.exports.texture.field import pixels_on, seen_from, texture_from_f
 from pipelines.exports.texture.levelling import levels
 from pipelines.exports.texture.photos import Photos, colors_at, softened
 from pipelines.exports.texture.refining import refine
-from pipelines.exports.texture.texels import ROWS, spread, texels_of
+from pipelines.exports.texture.texels import ROWS, moving, spread, texels_of
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
@@ -120,10 +119,10 @@ def texture_from_photos(
         ground,
         lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
     )
-    added = levels(charts, colors, _moving(on_progress, _COPY_SHARE, _LEVEL_SHARE, _MOST_POLLS))
+    added = levels(charts, colors, moving(on_progress, _COPY_SHARE, _LEVEL_SHARE, _MOST_POLLS))
     own: NDArray[np.floating[Any]] = mesh.colors
     calls = layout.side // ROWS + 4 * _SPREAD_PX
-    told = _moving(on_progress, _LEVEL_SHARE, _ADD_SHARE, calls)
+    told = moving(on_progress, _LEVEL_SHARE, _ADD_SHARE, calls)
     covered = _level(picture, charts, layout, added, told)
     if refined:
         own = refine(
@@ -139,14 +138,6 @@ def texture_from_photos(
         uv=layout.uv / layout.side,
         texture=picture,
     )
-
-
-def _moving(
-    on_progress: Callable[[float], None], begin: float, end: float, calls: int
-) -> Callable[[], None]:
-    """What tells progress from begin to end, a step further each time it is called."""
-    made = itertools.count(1)
-    return lambda: on_progress(begin + (end - begin) * min(next(made) / (calls + 1), 1.0))
 
 
 def _copied(

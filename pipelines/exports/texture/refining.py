@@ -25,10 +25,8 @@ vertices.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +35,7 @@ from scipy.sparse import csr_array
 from pipelines.exports.texture.charts import MARGIN_PX, Charts, Layout
 from pipelines.exports.texture.choice import LEAST_COSINE, NOBODY, Surface
 from pipelines.exports.texture.photos import Photos
-from pipelines.exports.texture.texels import spread
+from pipelines.exports.texture.texels import moving, spread
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -59,11 +57,10 @@ _PIXELS = 16_000_000
 _CHUNK = 2_000_000
 _SPREAD_PASSES = 2
 _ROWS = 256
-_LOOK_SHARE, _MARGIN_SHARE, _SOLVE_SHARE, _SPREAD_SHARE = 0.5, 0.55, 0.95, 0.99
+_LOOK_SHARE, _MARGIN_SHARE, _SOLVE_SHARE, _SPREAD_SHARE = 0.5, 0.55, 0.9, 0.94
 
 
-@dataclass(frozen=True)
-class _Looks:
+class _Looks(NamedTuple):
     """Some pixels of the photos. seen: [N, M or V], texels or vertices as each pixel mixes them.
     color: [N, 3]."""
 
@@ -94,7 +91,11 @@ def refine(
     )
     if of_texels:
         _refine_picture(picture, covered, of_texels, charts, layout, on_progress)
-    return refined_colors(colors.astype(np.float32), [(x.seen, x.color) for x in of_vertices])
+    return refined_colors(
+        colors.astype(np.float32),
+        of_vertices,
+        lambda done: on_progress(_SPREAD_SHARE + (1.0 - _SPREAD_SHARE) * done),
+    )
 
 
 def _refine_picture(
@@ -108,7 +109,7 @@ def _refine_picture(
     """Move the texture. looks: emptied, as they are large."""
     # What a patch shows around its faces may lie behind them: at a pixel that mixes both, the face
     # would make up for it.
-    told = _moving(on_progress, _LOOK_SHARE, _MARGIN_SHARE, 4 * MARGIN_PX)
+    told = moving(on_progress, _LOOK_SHARE, _MARGIN_SHARE, 4 * MARGIN_PX)
     spread(picture, covered, MARGIN_PX, told)
     half = layout.side // 2
     begun = np.empty((half, half, 3), np.float32)
@@ -117,27 +118,19 @@ def _refine_picture(
         begun[top : top + _ROWS] = _halved(rows) / np.float32(255.0)
     step, known = solved(
         begun,
-        [(look.seen, look.color) for look in looks],
+        looks,
         lambda done: on_progress(_MARGIN_SHARE + (_SOLVE_SHARE - _MARGIN_SHARE) * done),
     )
     looks.clear()
     del begun
-    told = _moving(on_progress, _SOLVE_SHARE, _SPREAD_SHARE, 4 * _SPREAD_PASSES)
+    told = moving(on_progress, _SOLVE_SHARE, _SPREAD_SHARE, 4 * _SPREAD_PASSES)
     spread(step, known, _SPREAD_PASSES, told)
     _add(picture, step, _last_row(charts, layout))
 
 
-def _moving(
-    on_progress: Callable[[float], None], begin: float, end: float, calls: int
-) -> Callable[[], None]:
-    """What tells progress from begin to end, a step further each time it is called."""
-    made = itertools.count(1)
-    return lambda: on_progress(begin + (end - begin) * min(next(made) / calls, 1.0))
-
-
 def solved(
     begun: Floats,
-    looks: list[tuple[csr_array, Bytes]],
+    looks: Sequence[tuple[csr_array, Bytes]],
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """What to add to a texture [T, T, 3] in [0, 1], and where that is known, [T, T].
@@ -161,16 +154,21 @@ def solved(
     return texture - begun, known
 
 
-def refined_colors(begun: Floats, looks: list[tuple[csr_array, Bytes]]) -> Floats:
+def refined_colors(
+    begun: Floats,
+    looks: Sequence[tuple[csr_array, Bytes]],
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> Floats:
     """Vertices' colours [V, 3] in [0, 1], moved towards what pixels show.
 
     looks: as those of `solved`, of vertices instead of texels: matrices [N, V].
     """
     colors = begun.copy()
-    for _ in range(_VERTEX_ROUNDS if looks else 0):
+    for turn in range(_VERTEX_ROUNDS if looks else 0):
         missed = np.zeros((len(colors), 4), np.float32)
-        for seen, color in looks:
+        for done, (seen, color) in enumerate(looks):
             missed += _missed(seen, color, colors)
+            on_progress((turn + (done + 1) / len(looks)) / _VERTEX_ROUNDS)
         held = missed[:, :3] + np.float32(_KEEP) * (begun - colors)
         colors += held / (missed[:, 3:] + np.float32(_KEEP))
     return colors

@@ -6,6 +6,7 @@ corners, F faces, N texels.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -68,6 +69,14 @@ def texels_of(
             face=found["primitive_ids"].numpy()[covered].astype(np.int64),
             weights=np.stack([1.0 - u - v, u, v], axis=1),
         )
+
+
+def moving(
+    on_progress: Callable[[float], None], begin: float, end: float, calls: int
+) -> Callable[[], None]:
+    """What tells progress from begin to end, a step further each time it is called."""
+    made = itertools.count(1)
+    return lambda: on_progress(begin + (end - begin) * min(next(made) / calls, 1.0))
 
 
 def spread(

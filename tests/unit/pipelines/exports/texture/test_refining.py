@@ -157,7 +157,11 @@ def test_a_vertex_that_no_pixel_sees_keeps_its_colour() -> None:
     truth = np.array([[0.2, 0.4, 0.6], [0.5, 0.5, 0.5], [0.7, 0.3, 0.4], [0.9, 0.9, 0.9]])
     color = np.rint(255.0 * (weights @ truth[:3])).astype(np.uint8)
     begun = np.clip(truth + 0.05, 0.0, 1.0).astype(np.float32)
-    found = refined_colors(begun, [(refining._of_corners(corners, weights, 4), color)])
+    told: list[float] = []
+    looks = [(refining._of_corners(corners, weights, 4), color)]
+    found = refined_colors(begun, looks, told.append)
+    assert told == sorted(set(told)), "each round is heard of"
+    assert told[-1] == 1.0
     assert np.abs(found[:3] - truth[:3]).max() < 0.01
     assert (found[3] == begun[3]).all()
 
