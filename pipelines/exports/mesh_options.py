@@ -74,7 +74,8 @@ class MeshOptions(CropOptions, TextureOptions):
     refine: Literal["photos", "none"] = Field(
         "photos",
         description="photos moves the fused surface onto what the training photos agree on, a "
-        "fraction of a voxel, and leaves out what no two of them show; none leaves it as fused.",
+        "fraction of a voxel, leaves out what no two of them show, and moves outlines onto the "
+        "photos' edges; none leaves it as fused.",
     )
     flatten: bool = Field(
         True,

@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pipelines.errors import ExportError, ToolError
 from pipelines.exports.chosen_crop import chosen_crop
@@ -28,6 +28,7 @@ from pipelines.exports.subject import Decision, Thing
 from pipelines.exports.subject_files import as_dict
 from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
 from pipelines.exports.surface.holes import close_holes, hole_limits
+from pipelines.exports.surface.outlines import outlined
 from pipelines.exports.surface.refinement import refined
 from pipelines.exports.surface.shells import (
     Method,
@@ -39,17 +40,19 @@ from pipelines.exports.surface.shells import (
 )
 from pipelines.exports.surface.views import known_depths, render_views
 from pipelines.exports.surface.watertight import is_closed, made_watertight, why_open
+from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.depth_views import Floats, Pinhole, ViewStore
 from pipelines.scene.known_depths import KnownDepths
-from pipelines.scene.stereo_views import stereo_view
+from pipelines.scene.stereo_views import ColorView, color_view, stereo_view
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
 
 REDUCE_SHARE = 0.86
 """Of the export's progress, when the shape is done."""
 _RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
-_MEND_SHARE, _REFINE_SHARE = 0.82, 0.83
+_MEND_SHARE, _CLOSED_SHARE, _REFINE_SHARE = 0.78, 0.79, 0.83
+_View = TypeVar("_View", StereoView, ColorView)
 _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 """Photos that refine the mesh are so long, or shorter where all of them would have more pixels."""
 
@@ -124,7 +127,8 @@ def plan_of(scene: TrainedScene, options: MeshOptions, place: Placement, ctx: St
 
 
 def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: StageContext) -> Surface:
-    """The surface within the plan's shells: fused, moved onto the photos, its small holes closed.
+    """The surface within the plan's shells: fused, moved onto the photos, its small holes closed,
+    its outlines moved onto the photos' edges.
 
     Raises ExportError `empty_mesh` where there is none.
     """
@@ -150,10 +154,13 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
             )
         if options.refine == "photos":
             mesh = _on_the_photos(mesh, scene, shells, options, ctx)
-        told = _part_of(ctx, "closing holes", _MEND_SHARE, _REFINE_SHARE)
+        told = _part_of(ctx, "closing holes", _MEND_SHARE, _CLOSED_SHARE)
         limits = hole_limits(shells, options.close_holes, options.max_distance)
         closing = close_holes(mesh, limits, store, told)
-    return Surface(closing.mesh, shells, method, coarser, closing.as_dict())
+    mesh = closing.mesh
+    if options.refine == "photos":
+        mesh = _on_the_edges(mesh, scene, ctx)
+    return Surface(mesh, shells, method, coarser, closing.as_dict())
 
 
 def _fused(
@@ -185,18 +192,35 @@ def _on_the_photos(
     ctx: StageContext,
 ) -> TriangleMesh:
     """The mesh moved onto what the training photos agree on."""
-    shown = scene.training_images()
-    side = _photo_side([scene.lens_of(image) for image in shown])
-    photos = [
-        stereo_view(ctx.workspace.images_root, image, scene.lens_of(image), side) for image in shown
-    ]
     return refined(
         mesh,
-        photos,
+        _photos(stereo_view, scene, ctx),
         _part_of(ctx, "refining", _FUSE_SHARE, _MEND_SHARE),
         flat=options.flatten,
         noise=max((shell.voxel for shell in shells if not shell.is_far), default=0.0),
     )
+
+
+def _on_the_edges(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
+    """The mesh with its outlines on the edges of the training photos."""
+    told = _part_of(ctx, "moving outlines", _CLOSED_SHARE, _REFINE_SHARE)
+    told(0.0)
+    return outlined(mesh, _photos(color_view, scene, ctx), told)
+
+
+def _photos(
+    load: Callable[[Path, PosedImage, Intrinsics, int], _View],
+    scene: TrainedScene,
+    ctx: StageContext,
+) -> list[_View]:
+    """The training photos as what refines the mesh wants them."""
+    shown = scene.training_images()
+    side = _photo_side([scene.lens_of(image) for image in shown])
+    photos = []
+    for image in shown:
+        photos.append(load(ctx.workspace.images_root, image, scene.lens_of(image), side))
+        ctx.check_cancelled()
+    return photos
 
 
 def part_of(options: MeshOptions, plan: Plan, surface: Surface, ctx: StageContext) -> Part:

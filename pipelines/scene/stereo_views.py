@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,6 +20,47 @@ from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.sensor_depth import load_sensor_depth
 
 _OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class ColorView:
+    """picture: [H, W, 3] uint8, sRGB, in the mean light. usable: [H, W], where it has something.
+
+    world_from_camera: [3, 4], OpenGL's axes.
+    """
+
+    picture: NDArray[np.uint8]
+    usable: NDArray[np.bool_]
+    lens: Pinhole
+    world_from_camera: NDArray[np.float64]
+
+    def reduced(self, factor: int) -> ColorView:
+        """The view at 1 / factor of its size; squares that are not whole are not usable."""
+        if factor == 1:
+            return self
+        height, width = (side // factor for side in self.usable.shape)
+        shape = (height, factor, width, factor)
+        whole = (slice(height * factor), slice(width * factor))
+        picture = self.picture[whole].reshape(*shape, 3).mean(axis=(1, 3), dtype=np.float32)
+        usable = np.logical_and.reduce(self.usable[whole].reshape(shape), axis=(1, 3))
+        lens = self.lens
+        smaller = Pinhole(width, height, *(value / factor for value in _lengths(lens)))
+        return ColorView(np.rint(picture).astype(np.uint8), usable, smaller, self.world_from_camera)
+
+
+def color_view(root: Path, image: PosedImage, lens: Intrinsics, long_side_px: int) -> ColorView:
+    """An image of a capture in colour, as `stereo_view` has it in grey."""
+    pinhole = Pinhole.of(lens, min(long_side_px, max(lens.width, lens.height)))
+    picture = undistorted_picture(root, image, lens, pinhole)
+    size = (pinhole.width, pinhole.height)
+    usable = np.ones(picture.shape[:2], np.float32)
+    if image.mask is not None:
+        with Image.open(root / image.mask) as opened:
+            mask = opened.convert("L").resize(size, Image.Resampling.NEAREST)
+        usable = np.where(np.asarray(mask) >= 128, usable, np.float32(-1.0))
+    usable = _undistorted(usable, lens, pinhole)
+    pose = np.asarray(image.world_from_camera, np.float64)
+    return ColorView(picture, usable > 0.0, pinhole, pose)
 
 
 def stereo_view(root: Path, image: PosedImage, lens: Intrinsics, long_side_px: int) -> StereoView:
@@ -95,6 +137,10 @@ def _undistorted(
     usable = inside & (np.minimum.reduce(corners) >= 0.0)
     values = np.where(usable, top + fv * (bottom - top), -1.0)
     return values.astype(np.float32)
+
+
+def _lengths(lens: Pinhole) -> tuple[float, float, float, float]:
+    return lens.fl_x, lens.fl_y, lens.cx, lens.cy
 
 
 def _is_distorted(lens: Intrinsics) -> bool:

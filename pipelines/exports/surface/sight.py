@@ -37,10 +37,10 @@ class Sight:
     def met(
         self, eye: Floats, ways: Floats
     ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
-        """What rays from an eye [3] along unit directions [N, 3] meet first.
+        """What rays from an eye [3] along directions [N, 3] meet first.
 
-        Returns distances [N], infinite where there is nothing, faces [N], there 0, and where in
-        the face as barycentric coordinates [N, 3].
+        Returns distances [N] in lengths of the directions, infinite where there is nothing, faces
+        [N], there 0, and where in the face as barycentric coordinates [N, 3].
         """
         rays = np.concatenate([np.broadcast_to(eye, ways.shape), ways], axis=1)
         found = self._scene.cast_rays(_core.Tensor(rays.astype(np.float32)))

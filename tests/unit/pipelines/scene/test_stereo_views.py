@@ -11,7 +11,7 @@ from PIL import Image
 
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.depth_views import Pinhole
-from pipelines.scene.stereo_views import sensor_depth, stereo_view
+from pipelines.scene.stereo_views import color_view, sensor_depth, stereo_view
 
 LENS = Intrinsics(200, 120, 150.0, 150.0, 101.0, 58.0)
 BENT = dataclasses.replace(LENS, model="OPENCV", k1=-0.2, k2=0.03, p1=0.004)
@@ -43,3 +43,38 @@ def test_depth_lies_under_the_picture_that_it_belongs_to(tmp_path: Path, lens: I
     assert straight is not None
     if lens is BENT:
         assert np.abs(straight - view.picture)[known].max() > 0.02, "the test sees no bending"
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT], ids=["pinhole", "bent"])
+def test_a_picture_in_colour_is_the_one_in_grey(tmp_path: Path, lens: Intrinsics) -> None:
+    """Also in what of it there is: not beyond a bent lens's frame, nor where a mask says no."""
+    row, column = np.mgrid[:120, :200]
+    grey = (40 + row + column // 2).astype(np.uint8)
+    Image.fromarray(grey).convert("RGB").save(tmp_path / "a.png")
+    Image.fromarray(np.where(column < 150, 255, 0).astype(np.uint8)).save(tmp_path / "mask.png")
+    image = PosedImage("a.png", 0, POSE, mask="mask.png")
+
+    found = color_view(tmp_path, image, lens, 100)
+
+    expected = stereo_view(tmp_path, image, lens, 100)
+    assert vars(found.lens) == vars(Pinhole(100, 60, *expected.lens))
+    assert np.array_equal(found.usable, expected.picture >= 0.0)
+    assert 0.6 < found.usable.mean() < 0.8
+    known = found.usable
+    assert np.abs(found.picture[known] / 255.0 - expected.picture[known][:, None]).max() < 0.01
+
+
+def test_a_reduced_picture_is_seen_through_a_smaller_lens(tmp_path: Path) -> None:
+    row, column = np.mgrid[:120, :200]
+    picture = np.stack([row, column, row + column // 2], axis=-1).astype(np.uint8)
+    Image.fromarray(picture).save(tmp_path / "a.png")
+    Image.fromarray(np.where(column < 151, 255, 0).astype(np.uint8)).save(tmp_path / "mask.png")
+    image = PosedImage("a.png", 0, POSE, mask="mask.png")
+    view = color_view(tmp_path, image, LENS, 200)
+
+    half = view.reduced(2)
+
+    assert vars(half.lens) == vars(Pinhole(100, 60, 75.0, 75.0, 50.5, 29.0))
+    assert np.abs(half.picture - picture[::2, ::2] - 0.5).max() <= 1.0
+    assert np.array_equal(half.usable, np.mgrid[:60, :100][1] < 75)
+    assert view.reduced(1) is view

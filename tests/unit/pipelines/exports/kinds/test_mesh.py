@@ -283,6 +283,7 @@ def test_a_cancel_ends_the_stage(job: Workspace) -> None:
     [
         ("fusing depth", {}),
         ("fusing depth", {"method": "marching_cubes"}),
+        ("moving outlines", {}),
         ("painting", {}),
         ("painting", {"texture": "field", "refine": "none"}),
         ("cutting out the subject", {}),

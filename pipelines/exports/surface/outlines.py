@@ -1,0 +1,145 @@
+"""A mesh whose outlines lie on the edges that the photos show there.
+
+Where a surface ends before another one, depth says little: a rendered pixel holds both, and a patch
+of a photo shows both, so that `pipelines.exports.surface.refinement` holds such vertices. Rims come
+out frayed, and a texture of photos has the background on them. But there a photo has an edge. So
+at each outline of the mesh, as a photo's camera sees it, the photo's colours I across it are
+compared with the mesh's own on both sides, F before and B behind it:
+
+    E(s) = sum_(t < s) min(|I(t) - F(t)|^2, c) + sum_(t >= s) min(|I(t) - B(t)|^2, c)
+
+with t in px along the outline's normal, 0 where the mesh ends; where E is least it should end. The
+search along normals is that of Harris and Stennett (RAPID, BMVC 1990); colours of both sides in
+place of gradients are after Hanek and Beetz (contracting curve density, IJCV 2004). Each answer is
+an equation for the face that ends there, o = s z / f across the ray; together, with neighbours that
+move alike, they give the moves of all vertices:
+
+    min_d  sum_j w_j (N_j . sum_k b_jk d_k - o_j)^2 + a sum_edges |d_i - d_k|^2 + h sum A_i |d_i|^2
+
+with b the place within the face, w the trust, less where an answer is far from the solution, and A
+the area around a vertex in squares of a pixel: so moves die away sqrt(a / h) px from an outline,
+whatever the size of the triangles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator, cg
+
+from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.surface.outline_views import Answers, OutlineView
+from pipelines.exports.surface.rings import MeshRings
+from pipelines.exports.surface.sight import Sight
+from pipelines.scene.stereo_views import ColorView
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Round:
+    """factor: photos are reduced by so much. stiffness: a above. begins: how far before the
+    outline, px, the mesh's colours are believed, one hypothesis each."""
+
+    factor: int
+    stiffness: float
+    begins: tuple[float, ...]
+
+
+_JUST, _DEEPER = 0.5, 3.0
+"""A flap at a rim has the background's colour: what it hangs on is found a little farther in."""
+_ROUNDS = (_Round(2, 1.0, (_JUST, _DEEPER)), _Round(1, 0.3, (_JUST,)), _Round(1, 0.3, (_JUST,)))
+_MOST_ANSWERS = 1_000_000
+_HOLD = 0.01
+_LEAST_AREA = 0.3
+"""Squares of a pixel: slivers are held too."""
+_REWEIGHTED = 4
+_ITERATIONS, _TOLERANCE = 200, 1e-3
+_SOME_VIEWS = 16
+_SOLVE_SHARE = 0.2
+"""Of a round's progress, for the moves."""
+
+
+def outlined(
+    mesh: TriangleMesh,
+    views: Sequence[ColorView],
+    on_progress: Callable[[float], None] = lambda done: None,
+) -> TriangleMesh:
+    """The mesh with its vertices moved so that it ends, for each view, where the photo says.
+
+    Colours and faces stay. views: undistorted photos with their cameras, in the mesh's world.
+    on_progress: told the share that is done; may raise.
+    """
+    if len(mesh.faces) == 0 or not views:
+        return mesh
+    origin = mesh.vertices.mean(axis=0)
+    vertices = mesh.vertices - origin
+    rings = MeshRings(mesh.faces, len(vertices))
+    corner_colors = mesh.colors[mesh.faces].astype(np.float32)
+    pixel = _pixels(vertices, views, origin)
+    for index, step in enumerate(_ROUNDS):
+        sight = Sight(vertices, mesh.faces)
+        parts = []
+        for number, view in enumerate(views):
+            seen = OutlineView(sight, corner_colors, view.reduced(step.factor), origin)
+            parts.append(seen.answers(step.begins))
+            done = (1.0 - _SOLVE_SHARE) * (number + 1) / len(views)
+            on_progress((index + done) / len(_ROUNDS))
+        answers = Answers.joined(parts).thinned(_MOST_ANSWERS)
+        area = np.maximum(rings.areas(vertices) / pixel**2, _LEAST_AREA)
+        vertices = vertices + _moves(answers, rings, step.stiffness, _HOLD * area)
+        on_progress((index + 1) / len(_ROUNDS))
+    return replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
+
+
+def _pixels(vertices: Floats, views: Sequence[ColorView], origin: Floats) -> Floats:
+    """[V]: how large a pixel is at each vertex, world units, in the median view of some."""
+    chosen = views[:: max(1, len(views) // _SOME_VIEWS)]
+    sizes = [
+        np.linalg.norm(vertices + origin - view.world_from_camera[:, 3], axis=1) / view.lens.fl_x
+        for view in chosen
+    ]
+    size: Floats = np.median(sizes, axis=0)
+    return size
+
+
+def _moves(answers: Answers, rings: MeshRings, stiffness: float, hold: Floats) -> Floats:
+    """The moves [V, 3] that fit those answers that are believed, and each other. hold: [V]."""
+    num, rows = rings.num_vertices, len(answers.offsets)
+    if rows == 0:
+        return np.zeros((num, 3))
+    columns = 3 * rings.faces[answers.faces][:, :, None] + np.arange(3)
+    values = answers.places[:, :, None] * answers.across[:, None, :]
+    starts = np.arange(0, 9 * rows + 1, 9)
+    told = csr_array((values.ravel(), columns.ravel(), starts), shape=(rows, 3 * num))
+    squared = told.power(2)
+    stiff: Any = rings.laplacian
+    held = np.repeat(hold, 3)
+    still = stiffness * np.repeat(rings.degree, 3) + held
+    weights, found = answers.trust, np.zeros(3 * num)
+
+    def product(moves: Floats) -> Floats:
+        spread = (stiff @ moves.reshape(num, 3)).ravel()
+        result: Floats = told.T @ (weights * (told @ moves)) + stiffness * spread + held * moves
+        return result
+
+    matrix = LinearOperator((3 * num, 3 * num), matvec=product, dtype=np.float64)
+    for _ in range(_REWEIGHTED):
+        diagonal = squared.T @ weights + still
+        scale = LinearOperator(matrix.shape, matvec=diagonal.__rtruediv__, dtype=np.float64)
+        found, _ = cg(
+            matrix,
+            told.T @ (weights * answers.offsets),
+            x0=found,
+            rtol=_TOLERANCE,
+            maxiter=_ITERATIONS,
+            M=scale,
+        )
+        left = (told @ found - answers.offsets) / answers.pixels
+        weights = answers.trust / (1.0 + left**2)
+    return found.reshape(num, 3)

@@ -1,0 +1,106 @@
+"""A board's frayed rim comes to lie where photos show that it ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.exports.mesh import empty_mesh
+from pipelines.exports.surface import outline_views, outlines
+from pipelines.exports.surface.outlines import outlined
+from tests.unit.pipelines.exports.surface import board
+
+NUM_RIM = 4 * board.CELLS
+
+
+def frayed(seed: int = 0) -> board.Floats:
+    """Px, a wave and what is each vertex's own."""
+    own = np.random.default_rng(seed).normal(size=NUM_RIM)
+    return 1.5 * np.sin(np.arange(NUM_RIM) / 9.0) + own
+
+
+@pytest.mark.parametrize("shift", [-2.0, 2.0])
+def test_a_rim_goes_to_the_photos_edge(shift: float) -> None:
+    mesh = board.mesh(frayed() + shift)
+
+    found = outlined(mesh, board.photos())
+
+    after = np.abs(board.rim_errors(found))
+    assert np.median(np.abs(board.rim_errors(mesh))) > 1.5
+    assert np.median(after) < 0.25
+    assert np.percentile(after, 90) < 0.8
+    assert np.array_equal(found.faces, mesh.faces)
+    assert np.array_equal(found.colors, mesh.colors)
+
+
+def test_few_answers_at_once_and_few_in_all_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outline_views, "_AT_ONCE", 100)
+    monkeypatch.setattr(outlines, "_MOST_ANSWERS", 500)
+
+    found = outlined(board.mesh(frayed()), board.photos())
+
+    assert np.median(np.abs(board.rim_errors(found))) < 0.3
+
+
+def test_a_flap_of_the_backgrounds_colour_is_seen_through() -> None:
+    mesh = board.mesh(np.full(NUM_RIM, 2.0), flap=1)
+
+    after = board.rim_errors(outlined(mesh, board.photos()))
+
+    assert abs(np.median(after)) < 0.5
+
+
+def test_what_is_right_stays() -> None:
+    mesh = board.mesh(np.zeros(NUM_RIM))
+
+    found = outlined(mesh, board.photos())
+
+    moved = np.linalg.norm(found.vertices - mesh.vertices, axis=1) / board.PIXEL
+    assert moved.max() < 0.5
+    assert np.allclose(found.normals, mesh.normals, atol=0.05)
+
+
+def test_photos_without_an_edge_say_nothing() -> None:
+    mesh = board.mesh(frayed())
+    grey = [replace(view, picture=np.full_like(view.picture, 128)) for view in board.photos()]
+
+    found = outlined(replace(mesh, colors=np.full_like(mesh.colors, 0.5)), grey)
+
+    assert np.array_equal(found.vertices, mesh.vertices)
+
+
+def test_what_a_mask_hides_says_nothing() -> None:
+    mesh = board.mesh(frayed())
+    hidden = [replace(view, usable=np.zeros_like(view.usable)) for view in board.photos()]
+
+    assert np.array_equal(outlined(mesh, hidden).vertices, mesh.vertices)
+
+
+def test_a_mesh_that_hides_nothing_stays() -> None:
+    mesh = board.mesh(frayed())
+    wall = mesh.with_faces(mesh.faces[len(mesh.faces) // 2 :])
+
+    assert np.array_equal(outlined(wall, board.photos()).vertices, wall.vertices)
+
+
+def test_nothing_to_do() -> None:
+    mesh = board.mesh(frayed())
+
+    assert outlined(mesh, []) is mesh
+    assert len(outlined(empty_mesh(), board.photos()).vertices) == 0
+
+
+def test_progress_is_told_and_may_end_it() -> None:
+    told: list[float] = []
+
+    def stop(done: float) -> None:
+        told.append(done)
+        if done > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        outlined(board.mesh(frayed()), board.photos(), stop)
+    assert told == sorted(told)
+    assert 0.5 < told[-1] < 0.7
