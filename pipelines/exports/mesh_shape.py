@@ -192,10 +192,11 @@ def _on_the_photos(
     ctx: StageContext,
 ) -> TriangleMesh:
     """The mesh moved onto what the training photos agree on."""
+    told = _part_of(ctx, "refining", _FUSE_SHARE, _MEND_SHARE)
     return refined(
         mesh,
-        _photos(stereo_view, scene, ctx),
-        _part_of(ctx, "refining", _FUSE_SHARE, _MEND_SHARE),
+        _photos(stereo_view, scene, ctx, told),
+        told,
         flat=options.flatten,
         noise=max((shell.voxel for shell in shells if not shell.is_far), default=0.0),
     )
@@ -204,22 +205,22 @@ def _on_the_photos(
 def _on_the_edges(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
     """The mesh with its outlines on the edges of the training photos."""
     told = _part_of(ctx, "moving outlines", _CLOSED_SHARE, _REFINE_SHARE)
-    told(0.0)
-    return outlined(mesh, _photos(color_view, scene, ctx), told)
+    return outlined(mesh, _photos(color_view, scene, ctx, told), told)
 
 
 def _photos(
     load: Callable[[Path, PosedImage, Intrinsics, int], _View],
     scene: TrainedScene,
     ctx: StageContext,
+    told: Callable[[float], None],
 ) -> list[_View]:
-    """The training photos as what refines the mesh wants them."""
+    """The training photos as what refines the mesh wants them; told, with 0, of each."""
     shown = scene.training_images()
     side = _photo_side([scene.lens_of(image) for image in shown])
     photos = []
     for image in shown:
+        told(0.0)
         photos.append(load(ctx.workspace.images_root, image, scene.lens_of(image), side))
-        ctx.check_cancelled()
     return photos
 
 

@@ -16,7 +16,7 @@ Exact scenes: precision, recall and F-score of the mesh at 1 and 2 % of the size
 where cameras saw (`pipelines.sample.judge`), and depth at true cameras. Folders with depth: that
 at held-out views. All: what the job's report says of mesh and cloud against held-out photos.
 Pictures: `depth.png` (photo | truth | mesh | error: red too near, blue too far, black missing) and
-`turntable.png`.
+`turntable.png` (the draft above the mesh, each coloured and shaded).
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def save_depths(compared: Compared, path: Path) -> None:
 
 
 def save_turntable(job: Workspace, path: Path) -> None:
-    """The delivered mesh all round, coloured and shaded; of a subject what is near it."""
+    """Draft and delivered mesh all round, coloured and shaded; of a subject what is near it."""
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
     poses = np.asarray([image.world_from_camera for image in cameras.images], np.float64)
     focus = find_focus(poses)
@@ -81,6 +81,11 @@ def save_turntable(job: Workspace, path: Path) -> None:
     if focus is not None:
         distance = float(np.linalg.norm(poses[:, :, 3] - focus, axis=1).mean())
         ball = (focus, SHOWN_DISTANCE * distance)
-    mesh = read_mesh(job.stage("mesh") / "mesh.glb")
-    paint = Texture(mesh.uv, mesh.texture) if isinstance(mesh, TexturedMesh) else mesh.colors
-    Image.fromarray(turntable(mesh.vertices, mesh.faces, paint, ball=ball)).save(path)
+    strips = []
+    for file in (job.stage("draft") / "draft.glb", job.stage("mesh") / "mesh.glb"):
+        if not file.exists():
+            continue
+        mesh = read_mesh(file)
+        paint = Texture(mesh.uv, mesh.texture) if isinstance(mesh, TexturedMesh) else mesh.colors
+        strips.append(turntable(mesh.vertices, mesh.faces, paint, ball=ball))
+    Image.fromarray(np.concatenate(strips)).save(path)

@@ -58,6 +58,8 @@ _MOST_ANSWERS = 1_000_000
 _HOLD = 0.01
 _LEAST_AREA = 0.3
 """Squares of a pixel: slivers are held too."""
+_RINGS = 8
+"""Of neighbours around an outline that move: farther away there is nothing left of a move."""
 _REWEIGHTED = 4
 _ITERATIONS, _TOLERANCE = 200, 1e-3
 _SOME_VIEWS = 16
@@ -110,25 +112,35 @@ def _pixels(vertices: Floats, views: Sequence[ColorView], origin: Floats) -> Flo
 
 def _moves(answers: Answers, rings: MeshRings, stiffness: float, hold: Floats) -> Floats:
     """The moves [V, 3] that fit those answers that are believed, and each other. hold: [V]."""
-    num, rows = rings.num_vertices, len(answers.offsets)
+    rows = len(answers.offsets)
+    moves = np.zeros((rings.num_vertices, 3))
     if rows == 0:
-        return np.zeros((num, 3))
-    columns = 3 * rings.faces[answers.faces][:, :, None] + np.arange(3)
+        return moves
+    corners = rings.faces[answers.faces]
+    near = np.zeros(rings.num_vertices)
+    near[corners] = 1.0
+    for _ in range(_RINGS):
+        near += rings.around @ near
+    free = np.flatnonzero(near)
+    place = np.zeros(rings.num_vertices, np.int64)
+    place[free] = np.arange(len(free))
+    columns = 3 * place[corners][:, :, None] + np.arange(3)
     values = answers.places[:, :, None] * answers.across[:, None, :]
     starts = np.arange(0, 9 * rows + 1, 9)
-    told = csr_array((values.ravel(), columns.ravel(), starts), shape=(rows, 3 * num))
+    told = csr_array((values.ravel(), columns.ravel(), starts), shape=(rows, 3 * len(free)))
     squared = told.power(2)
-    stiff: Any = rings.laplacian
-    held = np.repeat(hold, 3)
-    still = stiffness * np.repeat(rings.degree, 3) + held
-    weights, found = answers.trust, np.zeros(3 * num)
+    stiff: Any = rings.laplacian[free][:, free]
+    held = np.repeat(hold[free], 3)
+    still = stiffness * np.repeat(rings.degree[free], 3) + held
+    weights, found = answers.trust, np.zeros(3 * len(free))
 
-    def product(moves: Floats) -> Floats:
-        spread = (stiff @ moves.reshape(num, 3)).ravel()
-        result: Floats = told.T @ (weights * (told @ moves)) + stiffness * spread + held * moves
+    def product(tried: Floats) -> Floats:
+        spread = (stiff @ tried.reshape(-1, 3)).ravel()
+        result: Floats = told.T @ (weights * (told @ tried)) + stiffness * spread + held * tried
         return result
 
-    matrix = LinearOperator((3 * num, 3 * num), matvec=product, dtype=np.float64)
+    size = 3 * len(free)
+    matrix = LinearOperator((size, size), matvec=product, dtype=np.float64)
     for _ in range(_REWEIGHTED):
         diagonal = squared.T @ weights + still
         scale = LinearOperator(matrix.shape, matvec=diagonal.__rtruediv__, dtype=np.float64)
@@ -142,4 +154,5 @@ def _moves(answers: Answers, rings: MeshRings, stiffness: float, hold: Floats) -
         )
         left = (told @ found - answers.offsets) / answers.pixels
         weights = answers.trust / (1.0 + left**2)
-    return found.reshape(num, 3)
+    moves[free] = found.reshape(-1, 3)
+    return moves
