@@ -79,14 +79,13 @@ class _Outlines:
         return _Outlines(self.u[kept], self.v[kept], self.z[kept], self.normal[kept])
 
     def across(self, steps: Floats) -> tuple[Floats, Floats]:
-        """Pixels so far along the normals: u and v. steps: [T] or [P, T], px, or [P]."""
-        if np.shape(steps) == np.shape(self.u):
-            return self.u + steps * self.normal[:, 0], self.v + steps * self.normal[:, 1]
-        u = self.u[:, None] + steps * self.normal[:, :1]
-        return u, self.v[:, None] + steps * self.normal[:, 1:]
+        """Pixels [P, T], so far along each normal: u and v. steps: [T] px."""
+        u = self.u[:, None] + self.normal[:, :1] * steps
+        return u, self.v[:, None] + self.normal[:, 1:] * steps
 
     def moved(self, by: Floats) -> _Outlines:
-        u, v = self.across(by)
+        """Each along its own normal. by: [P] px."""
+        u, v = self.u + by * self.normal[:, 0], self.v + by * self.normal[:, 1]
         return _Outlines(u, v, self.z, self.normal)
 
 
@@ -188,7 +187,8 @@ class OutlineView:
         low, high = tried[first - 1], tried[first]
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            beyond = self._met(*outlines.across(middle))[0] > limit
+            there = outlines.moved(middle)
+            beyond = self._met(there.u, there.v)[0] > limit
             low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
         return outlines.moved(high)
 

@@ -9,6 +9,7 @@ import pytest
 
 from pipelines.exports.mesh import empty_mesh
 from pipelines.exports.surface import outline_views, outlines
+from pipelines.exports.surface.color_edges import STEPS
 from pipelines.exports.surface.outlines import outlined
 from tests.unit.pipelines.exports.surface import board
 
@@ -35,8 +36,11 @@ def test_a_rim_goes_to_the_photos_edge(shift: float) -> None:
     assert np.array_equal(found.colors, mesh.colors)
 
 
-def test_few_answers_at_once_and_few_in_all_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outline_views, "_AT_ONCE", 100)
+@pytest.mark.parametrize("at_once", [1, len(STEPS), 100], ids=["one", "as many as steps", "more"])
+def test_few_answers_at_once_and_few_in_all_are_enough(
+    monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
+    monkeypatch.setattr(outline_views, "_AT_ONCE", at_once)
     monkeypatch.setattr(outlines, "_MOST_ANSWERS", 500)
 
     found = outlined(board.mesh(frayed()), board.photos())
