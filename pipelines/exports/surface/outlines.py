@@ -14,11 +14,13 @@ place of gradients are after Hanek and Beetz (contracting curve density, IJCV 20
 an equation for the face that ends there, o = s z / f across the ray; together, with neighbours that
 move alike, they give the moves of all vertices:
 
-    min_d  sum_j w_j (N_j . sum_k b_jk d_k - o_j)^2 + a sum_edges |d_i - d_k|^2 + h sum A_i |d_i|^2
+    min_d  sum_j w_j (N_j . sum_k b_jk d_k - o_j)^2 + a sum_edges |d_i - d_k|^2
+           + sum_i A_i (h |d_i|^2 + g f_i (n_i . d_i)^2)
 
-with b the place within the face, w the trust, less where an answer is far from the solution, and A
-the area around a vertex in squares of a pixel: so moves die away sqrt(a / h) px from an outline,
-whatever the size of the triangles.
+with b the place within the face, w the trust, less where an answer is far from the solution, A the
+area around a vertex in squares of a pixel, n its normal and f how flat it is there: so moves die
+away sqrt(a / h) px from an outline, whatever the size of the triangles, and sooner where they would
+carry a wall along: seen at a grazing angle it goes many pixels along the ray for one across it.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.surface.outline_views import Answers, OutlineView
+from pipelines.exports.surface.refinement import sharpness
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
 from pipelines.scene.stereo_views import ColorView
@@ -55,7 +58,8 @@ _JUST, _DEEPER = 0.5, 3.0
 """A flap at a rim has the background's colour: what it hangs on is found a little farther in."""
 _ROUNDS = (_Round(2, 1.0, (_JUST, _DEEPER)), _Round(1, 0.3, (_JUST,)), _Round(1, 0.3, (_JUST,)))
 _MOST_ANSWERS = 1_000_000
-_HOLD = 0.01
+_HOLD = 0.03
+_HOLD_FLAT = 0.1
 _LEAST_AREA = 0.3
 """Squares of a pixel: slivers are held too."""
 _RINGS = 8
@@ -93,8 +97,8 @@ def outlined(
             done = (1.0 - _SOLVE_SHARE) * (number + 1) / len(views)
             on_progress((index + done) / len(_ROUNDS))
         answers = Answers.joined(parts).thinned(_MOST_ANSWERS)
-        area = np.maximum(rings.areas(vertices) / pixel**2, _LEAST_AREA)
-        vertices = vertices + _moves(answers, rings, step.stiffness, _HOLD * area)
+        holds = _holds(vertices, rings, pixel)
+        vertices = vertices + _moves(answers, rings, step.stiffness, *holds)
         on_progress((index + 1) / len(_ROUNDS))
     return replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
 
@@ -110,8 +114,20 @@ def _pixels(vertices: Floats, views: Sequence[ColorView], origin: Floats) -> Flo
     return size
 
 
-def _moves(answers: Answers, rings: MeshRings, stiffness: float, hold: Floats) -> Floats:
-    """The moves [V, 3] that fit those answers that are believed, and each other. hold: [V]."""
+def _holds(vertices: Floats, rings: MeshRings, pixel: Floats) -> tuple[Floats, Floats]:
+    """What moves cost: any one [V], and besides, its square, along [V, 3]. pixel: [V]."""
+    area = np.maximum(rings.areas(vertices) / pixel**2, _LEAST_AREA)
+    flat = np.sqrt(_HOLD_FLAT * area * (1.0 - sharpness(vertices, rings)))
+    return _HOLD * area, rings.normals(vertices) * flat[:, None]
+
+
+def _moves(
+    answers: Answers, rings: MeshRings, stiffness: float, hold: Floats, along: Floats
+) -> Floats:
+    """The moves [V, 3] that fit those answers that are believed, and each other.
+
+    hold: [V]. along: [V, 3]. Both as of `_holds`.
+    """
     rows = len(answers.offsets)
     moves = np.zeros((rings.num_vertices, 3))
     if rows == 0:
@@ -131,12 +147,17 @@ def _moves(answers: Answers, rings: MeshRings, stiffness: float, hold: Floats) -
     squared = told.power(2)
     stiff: Any = rings.laplacian[free][:, free]
     held = np.repeat(hold[free], 3)
-    still = stiffness * np.repeat(rings.degree[free], 3) + held
+    along = along[free]
+    still = stiffness * np.repeat(rings.degree[free], 3) + held + along.ravel() ** 2
     weights, found = answers.trust, np.zeros(3 * len(free))
 
     def product(tried: Floats) -> Floats:
-        spread = (stiff @ tried.reshape(-1, 3)).ravel()
-        result: Floats = told.T @ (weights * (told @ tried)) + stiffness * spread + held * tried
+        each = tried.reshape(-1, 3)
+        spread = (stiff @ each).ravel()
+        across = ((each * along).sum(axis=1, keepdims=True) * along).ravel()
+        result: Floats = (
+            told.T @ (weights * (told @ tried)) + stiffness * spread + held * tried + across
+        )
         return result
 
     size = 3 * len(free)

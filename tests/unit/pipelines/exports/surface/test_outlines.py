@@ -10,8 +10,11 @@ import pytest
 from pipelines.exports.mesh import empty_mesh
 from pipelines.exports.surface import outline_views, outlines
 from pipelines.exports.surface.color_edges import STEPS
+from pipelines.exports.surface.outline_views import Answers
 from pipelines.exports.surface.outlines import outlined
+from pipelines.exports.surface.rings import MeshRings
 from tests.unit.pipelines.exports.surface import board
+from tests.unit.pipelines.exports.surface.test_refinement import grid
 
 NUM_RIM = 4 * board.CELLS
 
@@ -108,3 +111,32 @@ def test_progress_is_told_and_may_end_it() -> None:
         outlined(board.mesh(frayed()), board.photos(), stop)
     assert told == sorted(told)
     assert 0.5 < told[-1] < 0.7
+
+
+def test_a_wall_whose_end_is_pulled_off_it_is_not_carried_along() -> None:
+    """A sheet with edges of five pixels: at its end by a pixel within its plane, or off it."""
+    side, pixel = 21, 0.2
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(side), np.arange(side)))
+    sheet = np.stack([x, y, np.zeros(len(x))], axis=1).astype(np.float64)
+    rings = MeshRings(grid(side, side), len(sheet))
+    last = np.flatnonzero((x[rings.faces] == side - 1).any(axis=1))
+    holds = outlines._holds(sheet, rings, np.full(len(sheet), pixel))
+
+    def pulled(way: tuple[float, float, float]) -> board.Floats:
+        """How far columns go that way, px."""
+        at_end = (x[rings.faces[last]] == side - 1).astype(np.float64)
+        answers = Answers(
+            last,
+            at_end / at_end.sum(axis=1, keepdims=True),
+            np.tile(way, (len(last), 1)),
+            np.full(len(last), pixel),
+            np.full(len(last), pixel),
+            np.ones(len(last)),
+        )
+        moves = outlines._moves(answers, rings, 0.3, *holds) @ np.array(way)
+        return moves.reshape(side, side).mean(axis=0) / pixel
+
+    within, off = pulled((1.0, 0.0, 0.0)), pulled((0.0, 0.0, 1.0))
+    assert within[-1] > 0.5
+    assert off[-1] > 0.3
+    assert np.abs(off[:-3]).max() < 0.3 * np.abs(within[:-3]).max() < 0.02
