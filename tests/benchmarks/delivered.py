@@ -5,11 +5,12 @@
 
 JOB is the folder of a finished job, which is only read. Its `mesh.ply` is reduced and painted as
 the export `mesh` does it, written as GLB, read back and cast at all held-out cameras as the stage
-`assess` does, at the size at which `evaluate` judged the model: PSNR on covered pixels, beside the
-model's own on whole pictures. Vertex colours are those of the trained field. With `--scene`, the
-analytic scene that all the jobs were filmed from (`--frames`, `--long-side`, as of `geometry`), the
-F-score at 1 and 2 % of its size too, and the mean error of the colours (0 to 1) of what lies within
-1 % of the true surface, against the scene's own there.
+`assess` does, each half of a photo in the light that the other tells, at the size at which
+`evaluate` judged the model: PSNR on covered pixels, beside the model's own on whole pictures.
+Vertex colours are those of the trained field. With `--scene`, the analytic scene that all the jobs
+were filmed from (`--frames`, `--long-side`, as of `geometry`), the F-score at 1 and 2 % of its size
+too, and the mean error of the colours (0 to 1) of what lies within 1 % of the true surface, against
+the scene's own there.
 """
 
 from __future__ import annotations
@@ -185,7 +186,7 @@ def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Ro
         scores = mean_scores(
             [
                 score_view(
-                    caster.view(views.cameras, index, _SAMPLES),
+                    views.lit(caster.view(views.cameras, index, _SAMPLES), index),
                     views.photo(index),
                     views.valid(index),
                 )
