@@ -18,7 +18,7 @@ move alike, they give the moves of all vertices:
            + sum_i A_i (h |d_i|^2 + g f_i (n_i . d_i)^2)
 
 with b the place within the face, w the trust, less where an answer is far from the solution, A the
-area around a vertex in squares of a pixel, n its normal and f how flat it is there: so moves die
+area around a vertex in squares of a pixel, n its normal and f 1 on planes, else 0: so moves die
 away sqrt(a / h) px from an outline, whatever the size of the triangles, and sooner where they would
 carry a wall along: seen at a grazing angle it goes many pixels along the ray for one across it.
 """
@@ -35,8 +35,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.surface.flatness import NOWHERE, find_flat_parts
 from pipelines.exports.surface.outline_views import Answers, OutlineView
-from pipelines.exports.surface.refinement import sharpness
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
 from pipelines.scene.stereo_views import ColorView
@@ -58,8 +58,8 @@ _JUST, _DEEPER = 0.5, 3.0
 """A flap at a rim has the background's colour: what it hangs on is found a little farther in."""
 _ROUNDS = (_Round(2, 1.0, (_JUST, _DEEPER)), _Round(1, 0.3, (_JUST,)), _Round(1, 0.3, (_JUST,)))
 _MOST_ANSWERS = 1_000_000
-_HOLD = 0.03
-_HOLD_FLAT = 0.1
+_HOLD = 0.01
+_HOLD_FLAT = 0.3
 _LEAST_AREA = 0.3
 """Squares of a pixel: slivers are held too."""
 _RINGS = 8
@@ -88,6 +88,8 @@ def outlined(
     rings = MeshRings(mesh.faces, len(vertices))
     corner_colors = mesh.colors[mesh.faces].astype(np.float32)
     pixel = _pixels(vertices, views, origin)
+    flat_parts = find_flat_parts(vertices, rings, lambda: on_progress(0.0))
+    on_plane = flat_parts.plane_of != NOWHERE
     for index, step in enumerate(_ROUNDS):
         sight = Sight(vertices, mesh.faces)
         parts = []
@@ -97,7 +99,7 @@ def outlined(
             done = (1.0 - _SOLVE_SHARE) * (number + 1) / len(views)
             on_progress((index + done) / len(_ROUNDS))
         answers = Answers.joined(parts).thinned(_MOST_ANSWERS)
-        holds = _holds(vertices, rings, pixel)
+        holds = _holds(vertices, rings, pixel, on_plane)
         vertices = vertices + _moves(answers, rings, step.stiffness, *holds)
         on_progress((index + 1) / len(_ROUNDS))
     return replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
@@ -114,10 +116,12 @@ def _pixels(vertices: Floats, views: Sequence[ColorView], origin: Floats) -> Flo
     return size
 
 
-def _holds(vertices: Floats, rings: MeshRings, pixel: Floats) -> tuple[Floats, Floats]:
-    """What moves cost: any one [V], and besides, its square, along [V, 3]. pixel: [V]."""
+def _holds(
+    vertices: Floats, rings: MeshRings, pixel: Floats, on_plane: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
+    """What moves cost: any one [V], and besides, its square, along [V, 3]. pixel, on_plane: [V]."""
     area = np.maximum(rings.areas(vertices) / pixel**2, _LEAST_AREA)
-    flat = np.sqrt(_HOLD_FLAT * area * (1.0 - sharpness(vertices, rings)))
+    flat = np.sqrt(_HOLD_FLAT * area * on_plane)
     return _HOLD * area, rings.normals(vertices) * flat[:, None]
 
 

@@ -74,7 +74,7 @@ def refined(
     if flat:
         parts = find_flat_parts(vertices, rings, lambda: on_progress(0.0))
         vertices = flattened(vertices, parts, rings)
-    sharp = sharpness(vertices, rings)
+    sharp = _sharpness(vertices, rings)
     photos_share = 1.0 - 2.0 * _FLAT_SHARE
 
     def on_photos(done: float) -> None:
@@ -152,7 +152,7 @@ def _seen(
     return seen
 
 
-def sharpness(vertices: Floats, rings: MeshRings) -> Floats:
+def _sharpness(vertices: Floats, rings: MeshRings) -> Floats:
     """[V] in [0, 1]: 0 where the surface is about flat, 1 at its edges and open borders."""
     total, area = rings.crossed(vertices)
     for _ in range(_NORMAL_ROUNDS):
