@@ -99,7 +99,7 @@ def ordered(mesh: TriangleMesh) -> TriangleMesh:
     faces = faces[whole]
     first = faces.argmin(axis=1)[:, None]
     faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
-    faces = faces[np.lexsort(faces.T[::-1])]
+    faces = faces[np.lexsort((faces[:, 2], faces[:, 0] * len(order) + faces[:, 1]))]
     kept = order[is_new]
     return TriangleMesh(
         mesh.vertices[kept], faces.astype(np.int32), mesh.colors[kept], mesh.normals[kept]

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from pipelines.exports.mesh import TriangleMesh, empty_mesh
+from pipelines.exports.mesh import Floats, TriangleMesh, empty_mesh
 from pipelines.exports.reduction import reduced
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.scene.bounds import SceneBounds
 
 _MIN_COMPONENT_SHARE = 0.02
-_DROP_SHARE = 0.2
+_INSIDE_SHARE, _DROP_SHARE = 0.1, 0.2
 
 
 def clean(
@@ -34,30 +35,46 @@ def clean(
     faces = mesh.faces[inside[mesh.faces].all(axis=1)]
     if len(faces) == 0:
         return empty_mesh()
-    origin = (bounds.box_min + bounds.box_max) / 2.0
-    legacy = to_open3d(replace(mesh, faces=faces), origin)
-    _drop_small_pieces(legacy)
+    on_progress(_INSIDE_SHARE)
+    large = mesh.with_faces(faces[in_large_pieces(mesh.vertices, faces)])
     on_progress(_DROP_SHARE)
-    if len(legacy.triangles) > max_faces:
-        legacy = to_open3d(
-            reduced(
-                from_open3d(legacy, origin),
-                max_faces,
-                lambda done: on_progress(_DROP_SHARE + (1.0 - _DROP_SHARE) * done),
-            ),
-            origin,
+    if len(large.faces) > max_faces:
+        large = reduced(
+            large,
+            max_faces,
+            lambda done: on_progress(_DROP_SHARE + (1.0 - _DROP_SHARE) * done),
         )
-    legacy.remove_degenerate_triangles()
-    _drop_small_pieces(legacy)
-    return from_open3d(legacy, origin)
+    a, b, c = large.faces.T
+    faces = large.faces[(a != b) & (b != c) & (c != a)]
+    large = large.with_faces(faces[in_large_pieces(large.vertices, faces)])
+    # Its numbers are small there, which normals are made of.
+    origin = (bounds.box_min + bounds.box_max) / 2.0
+    return from_open3d(to_open3d(large, origin), origin)
 
 
-def _drop_small_pieces(legacy: Any) -> None:
-    """Take away connected pieces with less than 2 % of the largest one's area, in place."""
-    labels, _, piece_areas = legacy.cluster_connected_triangles()
-    areas = np.asarray(piece_areas)
-    if len(areas) == 0:
-        return
-    small = areas < _MIN_COMPONENT_SHARE * areas.max()
-    legacy.remove_triangles_by_mask(small[np.asarray(labels)])
-    legacy.remove_unreferenced_vertices()
+def in_large_pieces(vertices: Floats, faces: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """[F]: faces [F, 3] of pieces with at least 2 % of the largest one's area.
+
+    A piece is what hangs together by edges.
+    """
+    if len(faces) == 0:
+        return np.zeros(0, np.bool_)
+    piece = _pieces(faces, len(vertices))
+    first = vertices[faces[:, 0]]
+    across = np.cross(vertices[faces[:, 1]] - first, vertices[faces[:, 2]] - first)
+    areas = np.bincount(piece, np.linalg.norm(across, axis=1))
+    kept: NDArray[np.bool_] = (areas >= _MIN_COMPONENT_SHARE * areas.max())[piece]
+    return kept
+
+
+def _pieces(faces: NDArray[np.integer], num_vertices: int) -> NDArray[np.integer]:
+    """[F], a number for each piece of faces that share edges."""
+    starts, ends = (faces[:, order].T.reshape(-1) for order in ([0, 1, 2], [1, 2, 0]))
+    edge = np.minimum(starts, ends).astype(np.int64) * num_vertices + np.maximum(starts, ends)
+    order = np.argsort(edge)
+    same = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
+    count = len(faces)
+    one, two = order[same] % count, order[same + 1] % count
+    links = coo_array((np.ones(len(same), np.int8), (one, two)), (count, count))
+    piece: NDArray[np.integer] = connected_components(links, directed=False)[1]
+    return piece

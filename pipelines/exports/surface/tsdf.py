@@ -40,7 +40,7 @@ _MIN_VIEWS = 2
 MOST_BLOCKS = 80_000
 """Blocks of voxels for which there is room, each with about 30 KB until the mesh is done."""
 _MANY, _COARSER = 4, 1.05
-_FIND_SHARE, _EXTRACT_SHARE = 0.25, 0.95
+_FIND_SHARE, _EXTRACT_SHARE, _ORDER_SHARE = 0.25, 0.9, 0.95
 
 
 class Sized(Protocol):
@@ -146,6 +146,7 @@ def fuse(
     nowhere = np.zeros(3)
     made = from_open3d(grid.extract_triangle_mesh(_MIN_VIEWS - 0.5).to_legacy(), nowhere)
     del grid, keys  # the field is larger than all that follows
+    on_progress(_ORDER_SHARE)
     # Its threads number vertices and faces as they come to them, another way in each run.
     return from_open3d(to_open3d(ordered(made), nowhere), origin)
 

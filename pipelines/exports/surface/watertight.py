@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.surface.borders import Loop, border_loops, knotted_edges
+from pipelines.exports.surface.clean import in_large_pieces
 from pipelines.exports.surface.holes import close_holes, diameter
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.triangulation import in_plane
@@ -31,8 +32,6 @@ Faces = NDArray[np.integer]
 
 _SAME = 1e-6
 """Of the mesh's size: vertices so near each other are one, as in files with 32-bit places."""
-_SMALL = 0.02
-"""Of the largest piece's area."""
 _BASE = 0.02
 """How far the base is beyond its piece, of the mesh's size."""
 _GOES_ON = 0.3
@@ -107,7 +106,7 @@ def _mended(mesh: TriangleMesh) -> TriangleMesh:
             break
         faces = faces[~knotted]
     if len(faces):
-        faces = _without_small_pieces(mesh.vertices, faces)
+        faces = faces[in_large_pieces(mesh.vertices, faces)]
     return mesh.with_faces(faces.astype(np.int32))
 
 
@@ -126,14 +125,6 @@ def _pieces(faces: Faces, count: int) -> Ints:
     links = coo_array((np.ones(pairs.shape[1], np.int8), (pairs[0], pairs[1])), (count, count))
     label: Ints = connected_components(links, directed=False)[1].astype(np.int64)
     return label
-
-
-def _without_small_pieces(vertices: Floats, faces: Ints) -> Ints:
-    """The faces of pieces that have at least `_SMALL` of the largest one's area."""
-    piece = _pieces(faces, len(vertices))[faces[:, 0]]
-    areas = np.bincount(piece, np.linalg.norm(_across(vertices, faces), axis=1))
-    large: Ints = faces[(areas >= _SMALL * areas.max())[piece]]
-    return large
 
 
 def _across(vertices: Floats, faces: Faces) -> Floats:

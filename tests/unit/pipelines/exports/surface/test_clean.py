@@ -7,7 +7,7 @@ import open3d
 import pytest
 
 from pipelines.exports.mesh import TriangleMesh
-from pipelines.exports.surface.clean import clean
+from pipelines.exports.surface.clean import clean, in_large_pieces
 from pipelines.exports.surface.open3d_mesh import to_open3d
 from pipelines.exports.surface.tsdf import fuse
 from pipelines.scene.bounds import SceneBounds
@@ -49,6 +49,15 @@ def test_small_loose_pieces_and_what_is_out_of_bounds_are_dropped(sphere: Triang
     assert np.linalg.norm(mesh.vertices - CENTER, axis=1).max() < 1.1
     half = SceneBounds(CENTER, 3.0, 6.0, CENTER - 1.3, CENTER + np.array([0.0, 1.3, 1.3]))
     assert clean(both, half, 10**6).vertices[:, 0].max() <= CENTER[0]
+
+
+def test_a_piece_hangs_together_by_edges() -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [-0.1, 0, 0], [0, -0.1, 0.0]])
+    faces = np.array([[0, 1, 2], [3, 2, 0], [0, 4, 5]], np.int32)  # a square, a chip at its corner
+
+    assert in_large_pieces(vertices, faces).tolist() == [True, True, False]
+    assert in_large_pieces(vertices, faces[2:]).tolist() == [True]
+    assert in_large_pieces(vertices, faces[:0]).tolist() == []
 
 
 def noisy_view(lens: Pinhole, pose: np.ndarray, rng: np.random.Generator) -> DepthView:
