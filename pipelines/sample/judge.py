@@ -19,6 +19,7 @@ from pipelines.sample.scene import (
     SUBJECT,
     Region,
     Scene,
+    in_picture,
     pose_matrix,
     seen_surface,
     surface_distance,
@@ -245,13 +246,7 @@ def _in_view(points: Floats, truth: CamerasFile) -> NDArray[np.bool_]:
     """Which points [N, 3] project into a true picture, hidden or not: [N]."""
     seen = np.zeros(len(points), dtype=np.bool_)
     for image in truth.images:
-        camera, pose = truth.cameras[image.camera], pose_matrix(image)
-        local = (points - pose[:, 3]) @ pose[:, :3]
-        depth = np.maximum(-local[:, 2], 1e-9)
-        x = camera.cx + camera.fl_x * local[:, 0] / depth
-        y = camera.cy - camera.fl_y * local[:, 1] / depth
-        inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
-        seen |= inside & (local[:, 2] < 0)
+        seen |= in_picture(points, truth.cameras[image.camera], pose_matrix(image))
     return seen
 
 

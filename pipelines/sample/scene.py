@@ -57,6 +57,9 @@ THINGS = Region((-1.1, -1.1, 0.04), (1.1, 1.1, 1.1))
 ROOM = Region((-5.0, -4.5, 0.0), (5.0, 4.5, 3.4))
 """All that there is."""
 
+_SAME = 1e-3
+"""Of a distance: what is met by so much nearer than a point stands before it."""
+
 SCENE_SIZE_M = SUBJECT.size
 
 
@@ -298,6 +301,30 @@ def seen_surface(
     keep = np.unique(np.linspace(0, len(points) - 1, min(num_points, len(points))).astype(int))
     thinned: Floats = points[keep]
     return thinned
+
+
+def in_picture(points: Floats, camera: Intrinsics, pose: Floats) -> NDArray[np.bool_]:
+    """Which points [N, 3] a camera at a pose [3, 4] has in its picture, hidden or not, [N]."""
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    depth = np.maximum(-local[:, 2], 1e-9)
+    x = camera.cx + camera.fl_x * local[:, 0] / depth
+    y = camera.cy - camera.fl_y * local[:, 1] / depth
+    inside: NDArray[np.bool_] = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+    return inside & (local[:, 2] < 0)
+
+
+def in_sight(points: Floats, truth: CamerasFile, scene: Scene = SAMPLE) -> NDArray[np.bool_]:
+    """Which points of the true surface [N, 3] are in a picture and not hidden there, [N]."""
+    seen = np.zeros(len(points), np.bool_)
+    for image in truth.images:
+        camera, pose = truth.cameras[image.camera], pose_matrix(image)
+        asked = np.flatnonzero(~seen & in_picture(points, camera, pose))
+        ways = points[asked] - pose[:, 3]
+        length = np.linalg.norm(ways, axis=1)
+        origins = np.broadcast_to(pose[:, 3], ways.shape).copy()
+        met = raycast(origins, ways / length[:, None], scene).t
+        seen[asked[met > (1.0 - _SAME) * length]] = True
+    return seen
 
 
 def surface_distance(points: Floats, scene: Scene = SAMPLE) -> Floats:

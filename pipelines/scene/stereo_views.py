@@ -52,13 +52,8 @@ def color_view(root: Path, image: PosedImage, lens: Intrinsics, long_side_px: in
     """An image of a capture in colour, as `stereo_view` has it in grey."""
     pinhole = Pinhole.of(lens, min(long_side_px, max(lens.width, lens.height)))
     picture = undistorted_picture(root, image, lens, pinhole)
-    size = (pinhole.width, pinhole.height)
-    usable = np.ones(picture.shape[:2], np.float32)
-    if image.mask is not None:
-        with Image.open(root / image.mask) as opened:
-            mask = opened.convert("L").resize(size, Image.Resampling.NEAREST)
-        usable = np.where(np.asarray(mask) >= 128, usable, np.float32(-1.0))
-    usable = _undistorted(usable, lens, pinhole)
+    there = np.ones(picture.shape[:2], np.float32)
+    usable = _undistorted(_unmasked(there, root, image), lens, pinhole)
     pose = np.asarray(image.world_from_camera, np.float64)
     return ColorView(picture, usable > 0.0, pinhole, pose)
 
@@ -75,14 +70,10 @@ def stereo_view(root: Path, image: PosedImage, lens: Intrinsics, long_side_px: i
         opened.draft("L", size)
         grey = opened.convert("L").resize(size, Image.Resampling.BOX)
     picture = np.asarray(grey, np.float32) / np.float32(255.0)
-    if image.mask is not None:
-        with Image.open(root / image.mask) as opened:
-            usable = opened.convert("L").resize(size, Image.Resampling.NEAREST)
-        picture = np.where(np.asarray(usable) >= 128, picture, np.float32(-1.0))
     pose = np.asarray(image.world_from_camera, np.float64)
     turned = np.column_stack([pose[:, :3] @ _OPENCV_AXES, pose[:, 3]])
-    shown = _undistorted(picture, lens, pinhole)
-    return StereoView(shown, (pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy), turned)
+    shown = _undistorted(_unmasked(picture, root, image), lens, pinhole)
+    return StereoView(shown, _lengths(pinhole), turned)
 
 
 def undistorted_picture(
@@ -118,6 +109,16 @@ def sensor_depth(
     return sampled(z, u * (width / lens.width) - 0.5, v * (height / lens.height) - 0.5)
 
 
+def _unmasked(picture: NDArray[np.float32], root: Path, image: PosedImage) -> NDArray[np.float32]:
+    """The picture [H, W], -1 where the image's mask is."""
+    if image.mask is None:
+        return picture
+    height, width = picture.shape
+    with Image.open(root / image.mask) as opened:
+        mask = opened.convert("L").resize((width, height), Image.Resampling.NEAREST)
+    return np.where(np.asarray(mask) >= 128, picture, np.float32(-1.0))
+
+
 def _undistorted(
     picture: NDArray[np.float32], lens: Intrinsics, pinhole: Pinhole
 ) -> NDArray[np.float32]:
@@ -140,6 +141,7 @@ def _undistorted(
 
 
 def _lengths(lens: Pinhole) -> tuple[float, float, float, float]:
+    """fl_x, fl_y, cx, cy, px."""
     return lens.fl_x, lens.fl_y, lens.cx, lens.cy
 
 

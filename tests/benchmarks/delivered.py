@@ -10,7 +10,7 @@ the export `mesh` does it, written as GLB, read back and cast at all held-out ca
 Vertex colours are those of the trained field. With `--scene`, the analytic scene that all the jobs
 were filmed from (`--frames`, `--long-side`, as of `geometry`), the F-score at 1 and 2 % of its size
 too, and the mean error of the colours (0 to 1) of what lies within 1 % of the true surface, against
-the scene's own there.
+the scene's own there: of all of it, and of where the true surface was in some camera's sight.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pipelines.judging.asset_views import MeshCaster, Texture
 from pipelines.options import AssessOptions
 from pipelines.sample.film import LONG_SIDE_PX, NUM_FRAMES, phone_camera, walk
 from pipelines.sample.judge import judge_poses, judge_surface
-from pipelines.sample.scene import Scene, raycast, surface_distance
+from pipelines.sample.scene import Scene, in_sight, raycast, surface_distance
 from pipelines.sample.scenes.catalogue import TAKES
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.orientation import Similarity
@@ -55,6 +55,7 @@ HEADER = (
     "F 1 %",
     "F 2 %",
     "colour error",
+    "in sight",
     "covered",
     "mesh dB",
     "model dB",
@@ -67,8 +68,8 @@ _NEAR_SURFACE = 0.01
 
 @dataclass
 class Row:
-    """f_1, f_2: F-score at 1 and 2 %; color_error: in [0, 1]; None where no truth is known. wall_s:
-    to make it."""
+    """f_1, f_2: F-score at 1 and 2 %; color_error: in [0, 1], and that of what was in sight; None
+    where no truth is known. wall_s: to make it."""
 
     job: str
     mesh: str
@@ -77,6 +78,7 @@ class Row:
     f_1: float | None
     f_2: float | None
     color_error: float | None
+    color_error_in_sight: float | None
     coverage: float | None
     mesh_db: float | None
     model_db: float
@@ -125,9 +127,14 @@ def kinds_of(
 
 
 def colors_off(
-    mesh: TriangleMesh | TexturedMesh, alignment: Similarity, scene: Scene, seed: int = 0
-) -> float:
-    """The mean error of a mesh's colours, evenly by area, where it lies near the true surface.
+    mesh: TriangleMesh | TexturedMesh,
+    alignment: Similarity,
+    scene: Scene,
+    truth: CamerasFile,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """The mean error of a mesh's colours, evenly by area, where it lies near the true surface; and
+    the same of where the true cameras saw that.
 
     The scene's colour is what is met on the way inwards from just outside.
     """
@@ -151,7 +158,10 @@ def colors_off(
     kept = (surface_distance(points, scene) <= near) & scene.room.contains(starts)
     hits = raycast(starts[kept], -out[kept], scene)
     met = hits.t <= 3.0 * near
-    return float(np.abs(found[kept] - np.clip(hits.color, 0.0, 1.0))[met].mean())
+    off = np.abs(found[kept] - np.clip(hits.color, 0.0, 1.0))[met]
+    true_points = starts[kept][met] - hits.t[met, None] * out[kept][met]
+    seen = in_sight(true_points, truth, scene)
+    return float(off.mean()), float(off[seen].mean())
 
 
 def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Row]:
@@ -196,9 +206,9 @@ def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Ro
         if given.scene and len(mesh.faces) not in known:
             surface = judge_surface(mesh.vertices, mesh.faces, alignment, truth, take.scene)
             known[len(mesh.faces)] = (surface.f_score[0.01], surface.f_score[0.02])
-        color_error = None
+        color_error = in_sight_error = None
         if given.scene:
-            color_error = colors_off(mesh, alignment, take.scene)
+            color_error, in_sight_error = colors_off(mesh, alignment, take.scene, truth)
         f_1, f_2 = known.get(len(mesh.faces), (None, None))
         coverage, mesh_db = scores["coverage"], scores["psnr"]
         yield Row(
@@ -209,6 +219,7 @@ def rows_of(job: Workspace, name: str, given: argparse.Namespace) -> Iterator[Ro
             f_1,
             f_2,
             color_error,
+            in_sight_error,
             coverage,
             mesh_db,
             metrics["psnr"],
@@ -226,6 +237,7 @@ def cells_of(row: Row) -> list[str]:
         number(row.f_1, 4),
         number(row.f_2, 4),
         number(row.color_error, 4),
+        number(row.color_error_in_sight, 4),
         number(row.coverage, 3),
         number(row.mesh_db),
         number(row.model_db),

@@ -68,7 +68,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=14,
+    version=15,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

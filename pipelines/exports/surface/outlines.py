@@ -58,8 +58,12 @@ _JUST, _DEEPER = 0.5, 3.0
 """A flap at a rim has the background's colour: what it hangs on is found a little farther in."""
 _ROUNDS = (_Round(2, 1.0, (_JUST, _DEEPER)), _Round(1, 0.3, (_JUST,)), _Round(1, 0.3, (_JUST,)))
 _MOST_ANSWERS = 1_000_000
-_HOLD = 0.01
+_HOLD = 0.003
+"""Answers' worth of staying where it is, for a square of a pixel: what few photos saw end there
+does not carry its surroundings away."""
 _HOLD_FLAT = 0.3
+"""The same along the normal, of vertices on a plane: seen at a few degrees, a wall ends far from
+where it should for an edge that is a little off."""
 _LEAST_AREA = 0.3
 """Squares of a pixel: slivers are held too."""
 _RINGS = 8
@@ -67,6 +71,7 @@ _RINGS = 8
 _REWEIGHTED = 4
 _ITERATIONS, _TOLERANCE = 200, 1e-3
 _SOME_VIEWS = 16
+"""Tell how large a pixel is, about."""
 _SOLVE_SHARE = 0.2
 """Of a round's progress, for the moves."""
 

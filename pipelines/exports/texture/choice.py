@@ -23,7 +23,7 @@ Ints = NDArray[np.int32]
 
 NOBODY = -1
 _CANDIDATES = 6
-LEAST_COSINE = 0.15
+_LEAST_COSINE = 0.15
 _UNLIKE = 0.15
 """Difference of a colour channel to the median of the candidates, beyond which one is not one."""
 _ROUNDS = 12
@@ -108,7 +108,7 @@ def _look(surface: Surface, photos: Photos, index: int, candidates: _Candidates)
     eye = photos.eye(index)
     toward = eye - surface.centers
     distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-30)
-    facing = (toward * surface.face_normals).sum(axis=1) > LEAST_COSINE * distance
+    facing = (toward * surface.face_normals).sum(axis=1) > _LEAST_COSINE * distance
     pixels, inside = photos.pixels(index, surface.vertices)
     faces = np.flatnonzero(facing & inside[surface.faces].all(axis=1))
     faces = faces[surface.unhindered(eye, faces)]

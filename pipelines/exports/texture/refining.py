@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from pipelines.exports.texture.charts import MARGIN_PX, Charts, Layout
-from pipelines.exports.texture.choice import LEAST_COSINE, NOBODY, Surface
+from pipelines.exports.texture.choice import NOBODY, Surface
 from pipelines.exports.texture.photos import Photos
 from pipelines.exports.texture.texels import moving, spread
 
@@ -47,6 +47,9 @@ _KEEP = 0.05
 """Pixels' worth of what was there before: a texel that hardly anything sees stays."""
 _JUMP = 0.03
 """Neighbouring pixels whose distances differ by a larger share see two surfaces."""
+_LEAST_COSINE = 0.05
+"""Less than a photo must have to be copied: of what all see at a glance alone, a glance says more
+than the field."""
 _COPIES = 3
 """Copies of the texture, of a half, a quarter and an eighth of its side."""
 _LEAST_SIDE = 1 << (_COPIES + 1)
@@ -305,7 +308,7 @@ def _met(
     eye, ways = photos.rays(index, pixels)
     distance, face, weights = surface.met(eye, ways)
     facing = -np.einsum("nd,nd->n", ways, surface.face_normals[face].astype(np.float32))
-    kept = np.isfinite(distance) & (facing > LEAST_COSINE)
+    kept = np.isfinite(distance) & (facing > _LEAST_COSINE)
     kept &= _even(distance.reshape(height, width)).reshape(-1)
     return kept, distance, face, weights
 

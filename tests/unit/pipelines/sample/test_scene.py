@@ -13,6 +13,7 @@ from pipelines.sample.scene import (
     SUBJECT,
     Floats,
     depth_image,
+    in_sight,
     pixel_rays,
     raycast,
     render,
@@ -155,6 +156,18 @@ def test_seen_surface_is_on_the_surface_within_the_region() -> None:
     assert surface_distance(points).max() < 1e-9
     assert points[:, 2].max() > 0.8
     assert ROOM.size > SUBJECT.size
+
+
+def test_what_was_seen_is_in_sight_and_what_is_behind_it_is_not() -> None:
+    truth = walk(6, phone_camera(240))
+    points = seen_surface(truth, num_points=3000)
+    assert in_sight(points, truth).all()
+    below = points - [0.0, 0.0, 0.01]
+    floor = points[:, 2] < 1e-6
+    assert floor.sum() > 100
+    assert not in_sight(below[floor], truth).any()
+    beyond = np.array([[0.0, 0.0, 3.4]])  # the ceiling, above all pictures
+    assert not in_sight(beyond, truth).any()
 
 
 def test_bad_rays_and_lenses_are_refused() -> None:
