@@ -1,7 +1,8 @@
-"""kill -9 of the worker in mid-training, of the stage process, of Redis and of the API.
+"""A worker told to stop while it looks for depth; kill -9 of the next one in mid-training, of the
+stage process, of Redis and of the API.
 
 Nothing is restarted by hand. The job must still succeed, no stage may run to its end twice, and
-training must go on from its checkpoint.
+depth and training must go on from their checkpoints.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from tests.samples import PLAIN
 pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 
 TINY: dict[str, Any] = {
-    "depth": {"long_side_px": 96, "num_planes": 32},
+    "depth": {"long_side_px": 400, "num_planes": 128},
     "train": {
         "max_steps": 1200,
         "rays_per_step": 512,
@@ -67,9 +68,9 @@ def until(question: Callable[[], bool], timeout_s: float, what: str) -> None:
         time.sleep(0.2)
 
 
-def training(job: Job) -> float:
-    """Progress of a running training, 0 where it does not run."""
-    (stage,) = (stage for stage in job.stages if stage.name == "train")
+def share_of(job: Job, name: str) -> float:
+    """Progress of a stage that runs, 0 where it does not."""
+    (stage,) = (stage for stage in job.stages if stage.name == name)
     return stage.progress if stage.state == "running" else 0.0
 
 
@@ -93,7 +94,12 @@ def test_job_succeeds_though_every_process_is_killed(
     capture = client.upload(archive)
     job = client.create_job(capture.id, preset="preview", options=TINY)
 
-    until(lambda: training(client.get_job(job.id)) > 0.1, 180, "training started")
+    until(lambda: share_of(client.get_job(job.id), "depth") > 0.2, 180, "depth was looked for")
+    stopped = supervisor.pids()["worker"]
+    os.kill(stopped, signal.SIGTERM)
+    until(lambda: supervisor.pids()["worker"] != stopped, 60, "another worker was started")
+
+    until(lambda: share_of(client.get_job(job.id), "train") > 0.1, 180, "training started")
     worker = supervisor.pids()["worker"]
     orphan = stage_process_of(worker)
     assert orphan is not None
@@ -101,7 +107,7 @@ def test_job_succeeds_though_every_process_is_killed(
     until(lambda: not Path(f"/proc/{orphan}").exists(), 10, "the orphaned stage process ended")
     until(lambda: supervisor.pids()["worker"] != worker, 5, "the worker was started again")
 
-    until(lambda: training(client.get_job(job.id)) > 0.2, 180, "training resumed")
+    until(lambda: share_of(client.get_job(job.id), "train") > 0.2, 180, "training resumed")
     child = stage_process_of(supervisor.pids()["worker"])
     assert child is not None
     os.kill(child, signal.SIGKILL)
@@ -118,3 +124,5 @@ def test_job_succeeds_though_every_process_is_killed(
     steps = [int(step) for step in re.findall(r"going on from step (\d+)", log)]
     assert len(steps) == 2, log[-2000:]
     assert 0 < steps[0] < steps[1], "training did not resume from its checkpoints"
+    log = "\n".join(client.logs(job.id, stage="depth"))
+    assert log.count("going on from the checkpoint") == 1, log[-2000:]
