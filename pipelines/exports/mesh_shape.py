@@ -26,7 +26,7 @@ from pipelines.exports.placement import Placement
 from pipelines.exports.reduction import reduced
 from pipelines.exports.subject import Decision, Thing
 from pipelines.exports.subject_files import as_dict
-from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
+from pipelines.exports.subject_search import SEARCH_SHARE, search_subject, stand_around
 from pipelines.exports.surface.holes import close_holes, hole_limits
 from pipelines.exports.surface.outlines import outlined
 from pipelines.exports.surface.refinement import refined
@@ -59,13 +59,15 @@ _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 
 @dataclass(frozen=True)
 class Plan:
-    """What is looked at. images, lenses: the views that are fused. shells: within the crop. known:
-    depth maps that vote beside the field. told_crop: what the report says of the crop. decision:
-    what was filmed, where that is asked for and no crop overrides it."""
+    """What is looked at. images, lenses: the views that are fused. shells: within the crop. method:
+    by which they are to be made. known: depth maps that vote beside the field. told_crop: what the
+    report says of the crop. decision: what was filmed, where that is asked for and no crop
+    overrides it."""
 
     images: Sequence[PosedImage]
     lenses: Sequence[Pinhole]
     shells: Sequence[Shell]
+    method: Method
     known: KnownDepths | None
     crop: Crop | None
     told_crop: dict[str, Any] | None
@@ -123,7 +125,10 @@ def plan_of(scene: TrainedScene, options: MeshOptions, place: Placement, ctx: St
     kept = [(shell, narrowed(shell.bounds, crop)) for shell in shells]
     shells = [replace(shell, bounds=bounds) for shell, bounds in kept if bounds is not None]
     decision = search() if crop is None and options.extent != "scene" else None
-    return Plan(images, lenses, shells, known, crop, told_crop, decision)
+    method = options.method
+    if method == "auto":
+        method = "poisson" if stand_around(scene) else "tsdf"
+    return Plan(images, lenses, shells, method, known, crop, told_crop, decision)
 
 
 def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: StageContext) -> Surface:
@@ -147,7 +152,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
         coarser = _coarser(plan.shells, shells)
         if coarser is not None:
             ctx.logger.warning("The mesh is coarser than asked for: %s", coarser["reason"])
-        mesh, method = _fused(scene, options, store, shells, ctx)
+        mesh, method = _fused(scene, options, store, shells, plan.method, ctx)
         if len(mesh.faces) == 0:
             raise _empty(
                 f"{len(plan.images)} views show no surface within the bounds that two agree on"
@@ -168,11 +173,12 @@ def _fused(
     options: MeshOptions,
     store: ViewStore,
     shells: Sequence[Shell],
+    method: Method,
     ctx: StageContext,
 ) -> tuple[TriangleMesh, Method]:
     """All shells as one mesh, and the method that made it."""
     told = _part_of(ctx, "fusing depth", _AFFORD_SHARE, _FUSE_SHARE)
-    faces, method = options.max_faces, options.method
+    faces = options.max_faces
     try:
         mesh = fuse_shells(store, shells, faces, told, method, scene.density, options.density_level)
     except ToolError as error:

@@ -40,6 +40,11 @@ _MAX_FACES = 50_000
 _RENDERED = 0.8
 
 
+def stand_around(scene: TrainedScene) -> bool:
+    """Whether the cameras stand around what they look at, by the cameras alone."""
+    return told_by_cameras(_gaze(scene)).why is None
+
+
 def search_subject(
     scene: TrainedScene, probes: Sequence[DepthView], ctx: StageContext, insist: bool = False
 ) -> Decision:
@@ -48,8 +53,7 @@ def search_subject(
     probes: `scene.probe_views()`. insist: to look for what stands where the cameras look also where
     nobody walked round anything; what was filmed is decided as without it.
     """
-    shown = scene.training_images()
-    gaze = gaze_of(shown, [scene.lens_of(image) for image in shown])
+    gaze = _gaze(scene)
     told = told_by_cameras(gaze)
     if told.why is not None and not insist:
         return Decision("scene", told.why, told.measures)
@@ -74,6 +78,11 @@ def search_subject(
             ),
             insist,
         )
+
+
+def _gaze(scene: TrainedScene) -> Gaze:
+    shown = scene.training_images()
+    return gaze_of(shown, [scene.lens_of(image) for image in shown])
 
 
 def decide_on(

@@ -4,11 +4,12 @@
         [--texture-px 8192] [--triangles 2000000] [--json out/mesh-memory.json]
 
 Each row is a process of its own, with no model in it: analytic depth views of a ball fused at a
-resolution, bounds included, as `mesh` does it (cleaned and reduced to 200,000 triangles); the ball
-painted with 24 photos of 3000 px; a ball of many triangles reduced to a tenth. `beyond` is what the
-peak is above the process before; children are told apart. The longest pause is the longest time
-between two reports of progress that moved, within which nobody can cancel either; `of CPU` is the
-most that this process computed in such a time, which others on the machine do not lengthen.
+resolution by TSDF and by Poisson, bounds included, as `mesh` does it (cleaned and reduced to
+200,000 triangles); the ball painted with 24 photos of 3000 px; a ball of many triangles reduced to
+a tenth. `beyond` is what the peak is above the process before; children are told apart. The longest
+pause is the longest time between two reports of progress that moved, within which nobody can cancel
+either; `of CPU` is the most that this process computed in such a time, which others on the machine
+do not lengthen.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tests.benchmarks.tables import markdown_table, number, write_json
+
+if TYPE_CHECKING:
+    from pipelines.exports.surface.shells import Method
 
 MIB = 2**20
 _MAX_FACES = 200_000
@@ -66,7 +70,7 @@ class Watch:
         self._last, self._at, self._cpu_at = done, now, cpu
 
 
-def fused(num_views: int, resolution: int, watch: Watch) -> str:
+def fused(method: Method, num_views: int, resolution: int, watch: Watch) -> str:
     """A ball of radius 1 in its bounds."""
     from pipelines.exports.surface.shells import Shell, affordable, fuse_shells
     from pipelines.scene.bounds import SceneBounds
@@ -83,7 +87,7 @@ def fused(num_views: int, resolution: int, watch: Watch) -> str:
         watch(0.0)
         asked = [Shell(bounds, bounds.longest_side / resolution)]
         shells = affordable(store, asked, lambda done: watch(0.2 * done))
-        mesh = fuse_shells(store, shells, _MAX_FACES, lambda done: watch(0.2 + 0.8 * done))
+        mesh = fuse_shells(store, shells, _MAX_FACES, lambda done: watch(0.2 + 0.8 * done), method)
     used = bounds.longest_side / shells[0].voxel
     return f"{used:.0f} voxels a side, {len(mesh.faces):,} faces"
 
@@ -145,8 +149,10 @@ def measure_here(label: str, work: Callable[[Watch], str]) -> Row:
 def work_of(label: str, num_views: int) -> Callable[[Watch], str]:
     """What the row of that label does."""
     kind, _, size = label.partition(" ")
-    if kind == "fuse":
-        return lambda watch: fused(num_views, int(size), watch)
+    if kind == "tsdf":
+        return lambda watch: fused("tsdf", num_views, int(size), watch)
+    if kind == "poisson":
+        return lambda watch: fused("poisson", num_views, int(size), watch)
     if kind == "paint":
         return lambda watch: painted(int(size), watch)
     return lambda watch: decimated(int(size), watch)
@@ -211,7 +217,8 @@ def main() -> None:
 
     machine = describe()
     print(heading(machine))
-    labels = [f"fuse {size}" for size in arguments.resolutions.split(",")]
+    sizes = arguments.resolutions.split(",")
+    labels = [f"{method} {size}" for method in ("tsdf", "poisson") for size in sizes]
     labels += [f"paint {arguments.texture_px}", f"reduce {arguments.triangles}"]
     rows = []
     for label in labels:

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from pipelines.exports.mesh import Floats, TriangleMesh, empty_mesh, ordered
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.exports.surface.tsdf import Blocks, Sized, touched_blocks, voxel_grid
+from pipelines.exports.surface.view_colors import seen_colors
 from pipelines.scene.bounds import SceneBounds
-from pipelines.scene.depth_views import DepthView
-from pipelines.scene.picture_sampling import between_pixels
 
 Density = Callable[[Floats], NDArray[np.floating[Any]]]
 """From points [N, 3], world, to density [N] per world unit."""
@@ -33,7 +32,6 @@ _MIN_VIEWS = 2
 """A surface that one view alone shows is not believed."""
 _BESIDE_VOXELS = 3.0
 """How far the surface may lie from a view's depth, along its axis, to be what that view sees."""
-_LEAST_COSINE = 0.1
 _TOGETHER = 512
 """Blocks asked at a time: 262,144 points."""
 _FIND_SHARE, _ASK_SHARE, _EXTRACT_SHARE = 0.1, 0.8, 0.85
@@ -116,34 +114,9 @@ def _seen(
 
     beside: how far from a view's depth a vertex may be, world units.
     """
-    count = np.zeros(len(mesh.vertices), np.int32)
-    total = np.zeros((len(mesh.vertices), 3))
-    for done, view in enumerate(views, start=1):
-        which, colors = _shown(mesh, view, beside)
-        count[which] += 1
-        total[which] += colors
-        on_progress(done / len(views))
+    count, mean = seen_colors(mesh, views, beside, on_progress)
     seen = count >= _MIN_VIEWS
     faces = mesh.faces[seen[mesh.faces].all(axis=1)]
     if len(faces) == 0:
         return empty_mesh()
-    mean: Floats = np.clip(total / np.maximum(count, 1)[:, None], 0.0, 1.0)
     return replace(mesh, colors=mean).with_faces(faces)
-
-
-def _shown(
-    mesh: TriangleMesh, view: DepthView, beside: float
-) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Which vertices a view sees from their front, [Q], and their colours there, [Q, 3]."""
-    lens, eye = view.lens, view.world_from_camera[:, 3]
-    toward = mesh.vertices - eye
-    x, y, back = (toward @ view.world_from_camera[:, :3]).T
-    depth = np.maximum(-back, 1e-12)
-    facing = -(toward * mesh.normals).sum(axis=1) > _LEAST_COSINE * np.linalg.norm(toward, axis=1)
-    column, row = lens.cx + lens.fl_x * x / depth, lens.cy - lens.fl_y * y / depth
-    inside = facing & (back < -1e-9) & (column >= 0) & (column < lens.width)
-    which = np.flatnonzero(inside & (row >= 0) & (row < lens.height))
-    found = view.z_depth[row[which].astype(int), column[which].astype(int)]
-    which = which[(found > 0) & (np.abs(found - depth[which]) <= beside)]
-    picture = np.asarray(view.rgb, np.float32) / np.float32(255.0)
-    return which, between_pixels(picture, column[which], row[which])

@@ -3,7 +3,8 @@
 Each cube of space with a voxel's side gets one point, the mean of what the views show in it, where
 two views at least show something and the others do not look through it; a smooth surface is laid
 through the points along their normals. Where it strays from them, as it does across what nobody
-saw, it is cut away. All happens in a frame whose origin is the middle of the bounds.
+saw, it is cut away. It has the mean of the colours in which views see it. All happens in a frame
+whose origin is the middle of the bounds.
 
 Source: Kazhdan and Hoppe, "Screened Poisson Surface Reconstruction", 2013, as Open3D does it.
 """
@@ -11,7 +12,7 @@ Source: Kazhdan and Hoppe, "Screened Poisson Surface Reconstruction", 2013, as O
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from pipelines.exports.surface import poisson_solver
 from pipelines.exports.surface.cloud import Cloud, oriented_normals
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.exports.surface.tsdf import Sized
+from pipelines.exports.surface.view_colors import seen_colors
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.consistency import consistent
 from pipelines.scene.depth_views import DepthView
@@ -33,10 +35,12 @@ _MIN_VIEWS = 2
 MOST_POINTS = 2_000_000
 """Points for which there is room; cubes become larger where there would be more."""
 _COARSER = 1.05
-_STRAY_CUBES = 1.5
+_STRAY_CUBES = 2.0
 """The surface ends so many cubes from the nearest point."""
 _FEWEST = 100
-_GATHER_SHARE, _AGREE_SHARE = 0.4, 0.5
+_BESIDE_CUBES = 3.0
+"""How far the surface may lie from a view's depth, along its axis, to be what that view sees."""
+_GATHER_SHARE, _AGREE_SHARE, _SOLVED_SHARE = 0.4, 0.5, 0.9
 _USUAL_S = 1e-4
 """How long a point takes, for what is told while nobody knows how far the solver is."""
 
@@ -98,7 +102,7 @@ def reconstruct(
         poisson_solver.__file__,
         given,
         _USUAL_S * len(cloud),
-        lambda done: on_progress(_AGREE_SHARE + (1.0 - _AGREE_SHARE) * done),
+        lambda done: on_progress(_AGREE_SHARE + (_SOLVED_SHARE - _AGREE_SHARE) * done),
     )
     made = TriangleMesh(
         solved["vertices"], solved["faces"], solved["colors"], np.zeros_like(solved["vertices"])
@@ -106,8 +110,14 @@ def reconstruct(
     made = _near(made, points, _STRAY_CUBES * side)
     if len(made.faces) == 0:
         return empty_mesh()
-    nowhere = np.zeros(3)
-    return from_open3d(to_open3d(ordered(made), nowhere), origin)
+    made = from_open3d(to_open3d(ordered(made), np.zeros(3)), origin)
+    count, colors = seen_colors(
+        made,
+        views,
+        _BESIDE_CUBES * side,
+        lambda done: on_progress(_SOLVED_SHARE + (1.0 - _SOLVED_SHARE) * done),
+    )
+    return replace(made, colors=np.where(count[:, None] > 0, colors, made.colors))
 
 
 def averaged(

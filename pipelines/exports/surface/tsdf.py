@@ -148,7 +148,8 @@ def fuse(
     del grid, keys  # the field is larger than all that follows
     on_progress(_ORDER_SHARE)
     # Its threads number vertices and faces as they come to them, another way in each run.
-    return from_open3d(to_open3d(ordered(made), nowhere), origin)
+    made = ordered(made, lambda done: on_progress(_ORDER_SHARE + (1.0 - _ORDER_SHARE) * done))
+    return from_open3d(to_open3d(made, nowhere), origin)
 
 
 def _farthest(view: DepthView) -> float:

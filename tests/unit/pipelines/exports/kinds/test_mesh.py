@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from pipelines.errors import Cancelled, ExportError
-from pipelines.exports import mesh_shape
+from pipelines.exports import mesh_shape, subject
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
@@ -83,6 +83,19 @@ def test_nothing_is_painted_where_no_file_carries_a_texture(job: Workspace) -> N
             np.testing.assert_allclose(255.0 * judged.colors, colors, atol=1.0)
         if extent == "auto":
             assert isinstance(read_mesh(job.stage("mesh") / "subject.glb"), TexturedMesh)
+
+
+def test_the_method_is_that_of_how_the_cameras_stand(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is asked for of it: they stand around a bowl here."""
+    plain = {"texture": "none", "refine": "none"}
+    crop = {"shape": "sphere", "center": (0.0, 0.0, 0.0), "size": (4.0, 4.0, 4.0)}
+    for asked in ({}, {"extent": "scene"}, {"crop": crop}):
+        assert tiny_job.run(job, "mesh", **plain, **asked)["summary"]["method"] == "poisson", asked
+    monkeypatch.setattr(subject, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
+    assert tiny_job.run(job, "mesh", **plain)["summary"]["method"] == "tsdf"
+    assert tiny_job.run(job, "mesh", method="poisson", **plain)["summary"]["method"] == "poisson"
 
 
 def test_there_is_a_mesh_also_where_the_solver_fails(
@@ -172,9 +185,10 @@ def test_marching_cubes_find_the_field_where_its_depth_is_and_a_crop_holds(job: 
 
 
 def test_the_mesh_has_the_triangles_asked_for_painted_all_the_same(job: Workspace) -> None:
-    before = tiny_job.run(job, "mesh")["summary"]
+    before = tiny_job.run(job, "mesh", method="tsdf")["summary"]
     full = read_ply(job.stage("mesh") / "mesh.ply")
-    after = tiny_job.run(job, "mesh", triangles=before["num_faces"] // 3)["summary"]
+    third = before["num_faces"] // 3
+    after = tiny_job.run(job, "mesh", method="tsdf", triangles=third)["summary"]
     assert after["num_faces"] == pytest.approx(before["num_faces"] / 3, rel=0.05)
     few = read_ply(job.stage("mesh") / "mesh.ply")
     painted = read_mesh(job.stage("mesh") / "mesh.glb")
