@@ -349,7 +349,7 @@ def test_a_mesh_for_which_memory_has_no_room_is_coarser_and_says_so(
 
 
 def test_holes_up_to_a_stated_size_are_closed_and_the_report_says_how_many(job: Workspace) -> None:
-    plain = {"texture": "none", "extent": "scene"}
+    plain = {"texture": "none", "extent": "scene", "method": "tsdf"}
     torn = tiny_job.run(job, "mesh", close_holes=0.0, **plain)["summary"]
     before = read_ply(job.stage("mesh") / "mesh.ply")
     assert torn["holes"] == {"closed": 0, "left_open": {}}
