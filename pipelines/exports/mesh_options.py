@@ -82,7 +82,8 @@ class MeshOptions(CropOptions, TextureOptions):
     flatten: bool = Field(
         True,
         description="Floors, walls and table tops become plane where they are so but for bumps of "
-        "a voxel or two, and as far as the photos do not say otherwise. Part of refine=photos.",
+        "a voxel or two, and as far as the photos do not say otherwise; what else is plain becomes "
+        "smooth. Part of refine=photos.",
     )
     close_holes: float = Field(
         0.1,

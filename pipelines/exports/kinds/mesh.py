@@ -68,7 +68,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=16,
+    version=17,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

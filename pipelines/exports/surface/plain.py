@@ -22,8 +22,6 @@ Floats = NDArray[np.float64]
 
 _LOOK_ROUNDS, _NORMAL_ROUNDS = 4, 20
 _ONE_COLOUR, _UNTOLD = 0.06, 0.3
-"""Spread of colours [0, 1] around a vertex, and trust in the photos' answers there, below which a
-surface is plain."""
 _FACING = 0.7
 _NEAR, _UNEVEN = 5.0, 1.0
 """Edges: what is farther from the plane does not belong to it, and the median distance of a region
@@ -41,7 +39,7 @@ def with_plain_parts(
 
     colors: [V, 3] in [0, 1]. trust: [V] in [0, 1], in what the photos say of each vertex.
     """
-    plain = _plain(rings, colors, trust)
+    plain = find_plain(rings, colors, trust, _ONE_COLOUR, _UNTOLD)
     facing = unit_normals(rings.spread(rings.normals(vertices), _NORMAL_ROUNDS))
     lengths = rings.scale(vertices)
     planes, plane_of = list(parts.planes), parts.plane_of.copy()
@@ -56,12 +54,18 @@ def with_plain_parts(
     return FlatParts(np.array(planes).reshape(-1, 4), plane_of)
 
 
-def _plain(rings: MeshRings, colors: Floats, trust: Floats) -> NDArray[np.bool_]:
-    """[V]: where all around has one colour and the photos have no say."""
+def find_plain(
+    rings: MeshRings, colors: Floats, trust: Floats, one_colour: float, untold: float
+) -> NDArray[np.bool_]:
+    """[V]: where all around has one colour and the photos have no say.
+
+    colors: [V, 3] in [0, 1]. trust: [V] in [0, 1], in what the photos say of each vertex. Both
+    limits are what stays below: the spread of the colours, and the mean trust.
+    """
     mean = rings.spread(colors, _LOOK_ROUNDS)
     variance = (rings.spread(colors**2, _LOOK_ROUNDS) - mean**2).sum(axis=1)
     told = rings.spread(trust[:, None], _LOOK_ROUNDS)[:, 0]
-    plain: NDArray[np.bool_] = (variance < _ONE_COLOUR**2) & (told < _UNTOLD)
+    plain: NDArray[np.bool_] = (variance < one_colour**2) & (told < untold)
     return plain
 
 

@@ -40,7 +40,8 @@ _STRAY_CUBES = 2.0
 _FEWEST = 100
 _BESIDE_CUBES = 3.0
 """How far the surface may lie from a view's depth, along its axis, to be what that view sees."""
-_GATHER_SHARE, _AGREE_SHARE, _SOLVED_SHARE = 0.4, 0.5, 0.9
+_GATHER_SHARE, _AGREE_SHARE, _ORIENTED_SHARE, _SOLVED_SHARE = 0.4, 0.5, 0.52, 0.85
+_NEAR_SHARE, _ORDERED_SHARE = 0.87, 0.9
 _USUAL_S = 1e-4
 """How long a point takes, for what is told while nobody knows how far the solver is."""
 
@@ -92,9 +93,11 @@ def reconstruct(
     if len(cloud) < _FEWEST:
         return empty_mesh()
     points: Floats = cloud.points - origin
+    normals = oriented_normals(cloud, origin)
+    on_progress(_ORIENTED_SHARE)
     given = {
         "points": points,
-        "normals": oriented_normals(cloud, origin),
+        "normals": normals,
         "colors": cloud.colors.astype(np.float64) / 255.0,
         "width": np.float64(side),
     }
@@ -102,20 +105,26 @@ def reconstruct(
         poisson_solver.__file__,
         given,
         _USUAL_S * len(cloud),
-        lambda done: on_progress(_AGREE_SHARE + (_SOLVED_SHARE - _AGREE_SHARE) * done),
+        lambda done: on_progress(_ORIENTED_SHARE + (_SOLVED_SHARE - _ORIENTED_SHARE) * done),
     )
+    on_progress(_SOLVED_SHARE)
     made = TriangleMesh(
         solved["vertices"], solved["faces"], solved["colors"], np.zeros_like(solved["vertices"])
     )
     made = _near(made, points, _STRAY_CUBES * side)
     if len(made.faces) == 0:
         return empty_mesh()
-    made = from_open3d(to_open3d(ordered(made), np.zeros(3)), origin)
+    on_progress(_NEAR_SHARE)
+    made = ordered(
+        made, lambda done: on_progress(_NEAR_SHARE + (_ORDERED_SHARE - _NEAR_SHARE) * done)
+    )
+    made = from_open3d(to_open3d(made, np.zeros(3)), origin)
+    on_progress(_ORDERED_SHARE)
     count, colors = seen_colors(
         made,
         views,
         _BESIDE_CUBES * side,
-        lambda done: on_progress(_SOLVED_SHARE + (1.0 - _SOLVED_SHARE) * done),
+        lambda done: on_progress(_ORDERED_SHARE + (1.0 - _ORDERED_SHARE) * done),
     )
     return replace(made, colors=np.where(count[:, None] > 0, colors, made.colors))
 

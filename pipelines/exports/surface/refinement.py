@@ -11,7 +11,8 @@ with t the trust, less where an answer is far from the solution, and s falling f
 whole regions move, then details. Where photos say nothing, vertices go with their neighbours.
 Vertices on sharp edges and open borders stay: there a patch on the tangent shows two things. What
 is about plane is made so before, as a wall whose normals tremble looks sharp all over, and once
-more in the end, as far as the photos do not say otherwise (`pipelines.exports.surface.flatness`).
+more in the end, as far as the photos do not say otherwise (`pipelines.exports.surface.flatness`);
+there what is plain and not plane becomes smooth (`pipelines.exports.surface.fairing`).
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import cg
 
 from pipelines.exports.mesh import TriangleMesh, unit_normals
-from pipelines.exports.surface.flatness import Answers, find_flat_parts, flattened
-from pipelines.exports.surface.plain import with_plain_parts
+from pipelines.exports.surface import fairing
+from pipelines.exports.surface.flatness import NOWHERE, Answers, find_flat_parts, flattened
+from pipelines.exports.surface.plain import find_plain, with_plain_parts
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
 from pipelines.nerf.stereo.refinement import Offsets, Pictures, photo_offsets
@@ -63,8 +65,9 @@ def refined(
     """The mesh with its vertices moved and without what no two views show.
 
     Colours stay. views: undistorted grey photos with their cameras, in the mesh's world. flat:
-    whether what is about plane becomes plane. noise: the edge whose parts bumps are, where edges
-    are shorter; world units. on_progress: told the share that is done; may raise.
+    whether what is about plane becomes plane, and what else is plain smooth. noise: the edge whose
+    parts bumps are, where edges are shorter; world units. on_progress: told the share that is done;
+    may raise.
     """
     if len(mesh.faces) == 0 or not views:
         return mesh
@@ -103,6 +106,8 @@ def refined(
         parts = with_plain_parts(parts, vertices, rings, mesh.colors, trust)
         answers = Answers(left, trust, offsets.step.astype(np.float64))
         vertices = flattened(vertices, parts, rings, answers)
+        plain = find_plain(rings, mesh.colors, trust, fairing.ONE_COLOUR, fairing.UNTOLD)
+        vertices = fairing.faired(vertices, plain & (parts.plane_of == NOWHERE), rings)
     on_progress(1.0)
     moved = replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
     return moved.with_faces(_shown_faces(mesh.faces, seen, rings))
