@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -87,7 +89,21 @@ def test_a_surface_that_is_right_stays() -> None:
 
 def test_nothing_moves_where_photos_say_nothing() -> None:
     mesh = sheet(0.05)
-    np.testing.assert_allclose(refined(mesh, views(plain=True)).vertices, mesh.vertices, atol=1e-9)
+    colors = np.random.default_rng(0).uniform(size=mesh.vertices.shape)
+    for still, flat in ((mesh, False), (replace(mesh, colors=colors), True)):
+        moved = refined(still, views(plain=True), flat=flat)
+        np.testing.assert_allclose(moved.vertices, mesh.vertices, atol=1e-9)
+
+
+def test_what_is_of_one_colour_besides_becomes_smooth() -> None:
+    mesh = sheet(0.05)
+    rough = np.random.default_rng(0).normal(scale=0.2 * STEP, size=len(mesh.vertices))
+    vertices = mesh.vertices + rough[:, None] * mesh.normals
+    smooth = refined(replace(mesh, vertices=vertices), views(plain=True))
+    rings = MeshRings(mesh.faces, len(vertices))
+    turned = [(rings.normals(of) * mesh.normals).sum(axis=1) for of in (vertices, smooth.vertices)]
+    before, after = (np.median(np.degrees(np.arccos(np.clip(each, -1.0, 1.0)))) for each in turned)
+    assert after < 0.5 * before
 
 
 def test_borders_stay() -> None:
