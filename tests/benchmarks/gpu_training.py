@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.data.plain_lines import PlainLines
 from pipelines.nerf.devices import choose_device
 from pipelines.nerf.engines.gpu.step import TrainingStep, capturable_adam, loss_scaler
 from pipelines.nerf.models.base import Model
@@ -74,7 +75,7 @@ class Run:
                 for name, (parameters, rate) in groups.items()
             },
             loss_scaler(device, config.rays_per_step),
-            PixelSampler(capture.images, capture.train, device),
+            PixelSampler(capture.images, capture.train, device, PlainLines.of(config)),
             cameras,
             config.rays_per_step,
             pixel_random=torch.Generator(device).manual_seed(0),

@@ -16,6 +16,9 @@ from pipelines.nerf.along_ray.intervals import bin_midpoints
 INTERLEVEL_EPS = 1e-7
 TERMINATION_FLOOR = 0.01
 """Light that ends at the known depth by chance: bounds what one wrong depth can ask for."""
+_LEAST_AHEAD, _LEAST_DISPARITY = 0.1, 1e-6
+"""Rays of a fisheye at 84 degrees to its axis, or more, have no place in a plane picture; what has
+no surface has no disparity to compare a bend with."""
 
 
 def color_loss(predicted: Tensor, truth: Tensor) -> Tensor:
@@ -96,6 +99,49 @@ def termination_loss(
     near = (weights * torch.exp(-0.5 * off.square())).sum(dim=-1)
     penalty = torch.where(known, -torch.log(near + TERMINATION_FLOOR), 0.0)
     return penalty.sum() / known.sum().clamp_min(1)
+
+
+def bend_loss(
+    weights: Tensor, t_edges: Tensor, local: Tensor, plain: Tensor, curve: float, limit: float
+) -> Tensor:
+    """Penalty on bumps of plain surfaces, by lines of four rays in one picture; a scalar.
+
+    (1/L) sum_l p_l (h(3 (r_1 - r_2)) + c h(r_1 + r_2)) over L lines, where r_1 and r_2 are how far
+    the disparities of the inner rays are from the straight line between those of the ends, relative
+    to these: what bends evenly has no first term, what is plane none at all. A ray's disparity is
+    sum_i w_i / z_i, which on a plane is linear in the picture. h is Huber's function,
+    b^2 / (2 limit) up to the limit.
+    weights: [4 L, S], of the rays at each place along the lines together, in their order. t_edges:
+    [4 L, S + 1], scene units. local: [4 L, 3], unit, the rays in the camera's axes (it looks along
+    -Z). plain: [L] in [0, 1]. curve: c.
+    The smoothness that RegNeRF (arXiv:2112.00724, eq. 3) asks of depth, here of disparity, along
+    lines where the picture is plain; surfaces that bend evenly after Moreton and Sequin, SIGGRAPH
+    1992.
+    """
+    ahead = -local[:, 2]
+    usable = ahead > _LEAST_AHEAD
+    safe = torch.where(usable, ahead, 1.0)[:, None]
+    disparity = (weights / bin_midpoints(t_edges)).sum(dim=-1) / safe[:, 0]
+    start, first, second, end = disparity.chunk(4)
+    origin, *inner, far = (local[:, :2] / safe).chunk(4)
+    along = far - origin
+    length = along.square().sum(dim=-1)
+    is_line = length > 0.0
+
+    def beside(found: Tensor, place: Tensor) -> Tensor:
+        share = ((place - origin) * along).sum(dim=-1) / torch.where(is_line, length, 1.0)
+        return found - (1.0 - share) * start - share * end
+
+    unit = (0.5 * (start + end)).detach().clamp_min(_LEAST_DISPARITY)
+    one, two = beside(first, inner[0]) / unit, beside(second, inner[1]) / unit
+    penalty = _huber(3.0 * (one - two), limit) + curve * _huber(one + two, limit)
+    counts = is_line & torch.stack(usable.chunk(4)).all(dim=0)
+    return torch.where(counts, plain * penalty, 0.0).mean()
+
+
+def _huber(off: Tensor, limit: float) -> Tensor:
+    size = off.abs()
+    return torch.where(size < limit, 0.5 * off.square() / limit, size - 0.5 * limit)
 
 
 def orientation_loss(weights: Tensor, normals: Tensor, directions: Tensor) -> Tensor:

@@ -6,19 +6,40 @@ images, B pixels of a batch.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pipelines.nerf.data.images import ImageData
+from pipelines.nerf.data.plain_lines import PER_LINE, PlainLines
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.options.train import DataConfig
 
 BLOCK_PIXELS = 64
 """Pixels of a mask that are counted together, so that its usable pixels need no list of their own:
 the counts take 3/8 of a byte a pixel, where positions would take 8."""
+
+_LOOKS, _SHORTEST_PX = 10, 3.0
+"""Colours looked at along a line, the rays' among them; half of a line is no shorter."""
+
+
+class Batch(NamedTuple):
+    """Pixels of a training step: first those on L lines, all that are first on theirs, all second
+    ones and so on; then single ones.
+
+    position: [B] int64. pixels: [B, 2] float32, centres, x and y. colors: [B, 3] in [0, 1]. plain:
+    [L] in [0, 1], how even the colours along each line are; 0 of one that would leave its picture
+    or its mask.
+    """
+
+    position: Tensor
+    pixels: Tensor
+    colors: Tensor
+    plain: Tensor
 
 
 def block_side(step: int, config: DataConfig) -> int:
@@ -40,12 +61,18 @@ class PixelSampler:
     block: side of the square of pixels that a ray stands for, 1 unless set. Images are cut into
         such squares from their first pixel on; a ray shows the mean of the usable pixels of its
         square and passes through the mean of their centres. What is drawn is the same at any side.
+    lines: what of a batch lies on lines; None for single pixels alone.
     Raises NerfError `too_few_images` where masks leave nothing.
     """
 
     def __init__(
-        self, images: ImageData, indices: Sequence[int], device: torch.device | str = "cpu"
+        self,
+        images: ImageData,
+        indices: Sequence[int],
+        device: torch.device | str = "cpu",
+        lines: PlainLines | None = None,
     ) -> None:
+        self.lines = lines
         self.device = torch.device(device)
         self.block = 1
         rows = torch.tensor(list(indices), dtype=torch.int64)
@@ -66,6 +93,29 @@ class PixelSampler:
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """(positions [B] int64, pixel centres [B, 2] float32 x and y, colours [B, 3] in [0, 1])."""
+        position, x, y = self._pick(count, generator)
+        if self.block > 1:
+            return position, *self._block_means(position, x, y)
+        places = torch.stack([x, y], dim=-1)
+        return position, places.float() + 0.5, self._colors_at(position, places)
+
+    def draw_batch(self, count: int, generator: torch.Generator) -> Batch:
+        """The pixels of a training step, `count` of them, on lines and single ones as of `draw`."""
+        num_lines = 0 if self.lines is None else self.lines.count(count)
+        position, pixels, colors = self.draw(count - PER_LINE * num_lines, generator)
+        if self.lines is None or num_lines == 0:
+            return Batch(position, pixels, colors, pixels.new_zeros(0))
+        config = self.lines.config
+        lined = self._draw_lines(num_lines, config.reach, config.contrast, generator)
+        return Batch(
+            torch.cat([lined.position, position]),
+            torch.cat([lined.pixels, pixels]),
+            torch.cat([lined.colors, colors]),
+            lined.plain,
+        )
+
+    def _pick(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Usable pixels: [B] int64 each of positions, columns and rows."""
         drawn = torch.randint(self._total, (count,), generator=generator, device=self.device)
         if self._usable is None:
             position = torch.searchsorted(self._ends, drawn, right=True)
@@ -74,11 +124,52 @@ class PixelSampler:
             position, row = self._usable.find(drawn)
             within = row - self._starts[position]
         width = self._widths[position]
-        x, y = within % width, torch.div(within, width, rounding_mode="floor")
-        if self.block > 1:
-            return position, *self._block_means(position, x, y)
-        colors = self._pixels[self._starts[position] + within].float() / 255.0
-        return position, torch.stack([x, y], dim=-1).float() + 0.5, colors
+        return position, within % width, torch.div(within, width, rounding_mode="floor")
+
+    def _rows_of(self, position: Tensor, places: Tensor) -> Tensor:
+        """Rows of the images' pixels. position: [...] and places: [..., 2] int64, x and y."""
+        return self._starts[position] + places[..., 1] * self._widths[position] + places[..., 0]
+
+    def _colors_at(self, position: Tensor, places: Tensor) -> Tensor:
+        return self._pixels[self._rows_of(position, places)].float() / 255.0
+
+    def _draw_lines(
+        self, count: int, reach: float, contrast: float, generator: torch.Generator
+    ) -> Batch:
+        """Lines of four pixels at equal distances: around a usable one, of a random length and
+        direction. One that would leave its picture, or its mask, shrinks to that pixel.
+
+        reach, contrast: as of the options. A line's colours are compared with those that lie
+        straight between its ends, p = exp(-(largest difference / contrast)^2).
+        """
+        position, x, y = self._pick(count, generator)
+        middle = torch.stack([x, y], dim=-1)
+        size = torch.stack([self._widths[position], self._heights[position]], dim=-1)
+        longest = (size.amax(dim=-1) * reach / _SHORTEST_PX).clamp_min(1.0)
+        drawn = torch.rand(2, count, generator=generator, device=self.device)
+        length, angle = _SHORTEST_PX * longest ** drawn[0], math.pi * drawn[1]
+        third = torch.stack([angle.cos(), angle.sin()], dim=-1) * (length / 3.0)[:, None]
+        step = 3 * third.round().long()
+        inside = ((middle >= step.abs()) & (middle + step.abs() < size)).all(dim=-1)
+        step = torch.where(inside[:, None], step, 0)
+        share = torch.linspace(0.0, 1.0, _LOOKS, device=self.device)[:, None]
+        places = middle[:, None] + ((2.0 * share - 1.0) * step[:, None]).round().long()
+        everywhere = position[:, None].expand(-1, _LOOKS)
+        usable = inside
+        if self._usable is not None:
+            usable = inside & self._usable.valid[self._rows_of(everywhere, places)].all(dim=1)
+            places = torch.where(usable[:, None, None], places, middle[:, None])
+        seen = self._colors_at(everywhere, places)
+        even = seen[:, :1] * (1.0 - share) + seen[:, -1:] * share
+        stray = (seen - even).abs().amax(dim=(1, 2)) / contrast
+        on_line = slice(None, None, (_LOOKS - 1) // (PER_LINE - 1))
+        pixels, colors = (item[:, on_line].transpose(0, 1).flatten(0, 1) for item in (places, seen))
+        return Batch(
+            position.repeat(PER_LINE),
+            pixels.float() + 0.5,
+            colors,
+            torch.where(usable, torch.exp(-stray.square()), 0.0),
+        )
 
     def _block_means(self, position: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Mean centre [B, 2] and colour [B, 3] of the usable pixels in the squares around pixels.

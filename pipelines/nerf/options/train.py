@@ -99,6 +99,39 @@ class DepthLossConfig:
 
 
 @dataclass(frozen=True)
+class FlatLossConfig:
+    """Plain surfaces have no bumps: lines of evenly coloured pixels as one more thing to fit.
+
+    Nothing else tells their depth, so that they may bend, but not unevenly. See
+    `along_ray.losses.bend_loss`.
+    """
+
+    weight: float = option(
+        0.05,
+        "Weight of how unevenly such lines bend; 0 leaves it out.",
+        ge=0.0,
+        le=10.0,
+    )
+    curve: float = option(
+        0.2, "Weight, beside that, of how much they bend at all.", ge=0.0, le=10.0
+    )
+    share: float = option(0.2, "Share of the rays that lie on lines, four on each.", ge=0.0, le=1.0)
+    reach: float = option(
+        0.1, "Longest half of a line, as a part of the picture's long side.", ge=0.001, le=0.5
+    )
+    contrast: float = option(
+        0.03, "How far colours of a plain line stray from even shading, in [0, 1].", ge=1e-3, le=1.0
+    )
+    limit: float = option(
+        0.02,
+        "Bend, relative to the depth, from which on it counts by itself and no longer by its "
+        "square: an edge is no bend.",
+        ge=1e-4,
+        le=1.0,
+    )
+
+
+@dataclass(frozen=True)
 class OptimizerConfig:
     """Adam and its exponential decay; rates as nerfstudio 1.1.5."""
 
@@ -146,6 +179,9 @@ class TrainConfig:
     data: DataConfig = field(default_factory=DataConfig, metadata={"help": "The data's options."})
     depth: DepthLossConfig = field(
         default_factory=DepthLossConfig, metadata={"help": "What depth maps are used for."}
+    )
+    flat: FlatLossConfig = field(
+        default_factory=FlatLossConfig, metadata={"help": "How plain surfaces are kept from bumps."}
     )
     optimizer: OptimizerConfig = field(
         default_factory=OptimizerConfig, metadata={"help": "The optimiser's options."}

@@ -22,6 +22,7 @@ from torch import Tensor
 from pipelines.nerf.data.depth_maps import DepthMaps, DepthSupervision
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.data.pixels import PixelSampler, block_side
+from pipelines.nerf.data.plain_lines import PlainLines
 from pipelines.nerf.devices import choose_device
 from pipelines.nerf.engines.gpu.step import StepLosses
 from pipelines.nerf.errors import NerfError
@@ -106,7 +107,8 @@ def train(
     state = initial_state(config, len(train_indices), seed, device, pixels_on)
     if checkpoint_path is not None and checkpoint_path.exists():
         _resume(state, checkpoint_path, fingerprint)
-    sampler = PixelSampler(images, train_indices, state.pixel_random.device)
+    pixels_on = state.pixel_random.device
+    sampler = PixelSampler(images, train_indices, pixels_on, PlainLines.of(config))
     posed = posed.to(device)
     state.model.train()
     graphs = _gpu_steps(state, sampler, posed, config, supervision)
@@ -219,8 +221,8 @@ def optimise_once(
     plan = model.plan_step(state.step, state.model_random)
 
     sampler.block = shape.block
-    drawn = sampler.draw(shape.num_rays, state.pixel_random)
-    index, pixels, colors = (item.to(device) for item in drawn)
+    drawn = sampler.draw_batch(shape.num_rays, state.pixel_random)
+    index, pixels, colors, plain = (item.to(device) for item in drawn)
     rays = cameras.generate_rays(index, pixels)
     with torch.autocast(device.type, dtype=torch.float16, enabled=device.type == "cuda"):
         outputs = model(rays, plan=plan, generator=state.model_random)
@@ -228,6 +230,10 @@ def optimise_once(
     if depth is not None:
         term = depth.loss(outputs, rays, cameras, *depth.schedule(state.step))
         losses = losses if term is None else {**losses, "depth": term}
+    if sampler.lines is not None:
+        weight = sampler.lines.weight(state.step)
+        term = sampler.lines.loss(outputs, rays, cameras, plain, weight)
+        losses = losses if term is None else {**losses, "flat": term}
     values = _checked_values(losses, state.step) if check else {}
     scale = state.scaler.get_scale() if check and state.scaler.is_enabled() else None
 

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.data.pixels import PixelSampler, block_side
+from pipelines.nerf.data.plain_lines import PlainLines
 from pipelines.nerf.engines.gpu.step import EAGER_STEPS, TrainingStep, capturable_adam, loss_scaler
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
@@ -307,7 +308,8 @@ def _start(config: TrainConfig, device: torch.device, setting: Setting, engine: 
         corrections = model.cameras_delta.parameters()
         optimizers["cameras"] = capturable_adam(corrections, LEARNING_RATE, eps, device)
     pixels_on = torch.device("cpu") if setting.fed else device
-    sampler = PixelSampler(_pictures(masked=setting.masked), range(NUM_IMAGES), pixels_on)
+    pictures = _pictures(masked=setting.masked)
+    sampler = PixelSampler(pictures, range(NUM_IMAGES), pixels_on, PlainLines.of(config))
     sampler.block = block_side(0, config.data)
     pixel_random = torch.Generator(pixels_on).manual_seed(1)
     model_random = torch.Generator(device).manual_seed(2)

@@ -34,7 +34,7 @@ import torch
 from torch import Tensor, nn
 
 from pipelines.nerf.data.depth_maps import DepthSupervision
-from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.data.pixels import Batch, PixelSampler
 from pipelines.nerf.engines.gpu.graphs import CudaGraphs, Recorder, Replay
 from pipelines.nerf.models.base import Model, StepPlan
 from pipelines.nerf.models.nerfacto import Nerfacto
@@ -169,18 +169,21 @@ class TrainingStep:
         self._recorder: Recorder | None = None if isinstance(capture, bool) else capture
         if capture is None and self._stream is not None and can_capture(model, self.device):
             self._recorder = CudaGraphs(self.device, self._stream, (pixel_random, model_random))
-        self._fed: tuple[Tensor, Tensor, Tensor] | None = None
+        self._fed: Batch | None = None
         if sampler.device.type != self.device.type if feed is None else feed:
-            self._fed = (
+            num_lines = 0 if sampler.lines is None else sampler.lines.count(rays_per_step)
+            self._fed = Batch(
                 torch.zeros(rays_per_step, dtype=torch.int64, device=self.device),
                 torch.zeros(rays_per_step, 2, device=self.device),
                 torch.zeros(rays_per_step, 3, device=self.device),
+                torch.zeros(num_lines, device=self.device),
             )
         if on_gpu:
             for optimizer in self.optimizers.values():
                 _hold_on_device(optimizer, self.device)
         self._exponent = torch.ones((), dtype=torch.float32, device=self.device)
         self._depth_weight, self._depth_spread = torch.ones(2, device=self.device).unbind()
+        self._flat_weight = torch.ones((), device=self.device)
         self._values = torch.zeros(MAX_TERMS + 1, dtype=torch.float32, device=self.device)
         self._largest_scale = loss_scale(rays_per_step)
         self._one = torch.ones((), dtype=torch.float32, device=self.device)
@@ -204,6 +207,8 @@ class TrainingStep:
             weight, spread = self._depth.schedule(step)
             self._depth_weight.fill_(weight)
             self._depth_spread.fill_(spread)
+        if self._sampler.lines is not None:
+            self._flat_weight.fill_(self._sampler.lines.weight(step))
         plan = self._model.plan_step(step, self._model_random)
         kind = Kind(plan.update_proposals, bool(plan.exponent != 1.0))
         if self._stream is None:
@@ -223,7 +228,7 @@ class TrainingStep:
         if runs <= EAGER_STEPS or not (is_eager or kind in self._graphs):
             self._before_new()
         if self._fed is not None:
-            drawn = self._sampler.draw(self._rays_per_step, self._pixel_random)
+            drawn = self._sampler.draw_batch(self._rays_per_step, self._pixel_random)
             for held, item in zip(self._fed, drawn, strict=True):
                 # From pinned memory, which the allocator keeps until the copy is done.
                 item = item.pin_memory() if self._stream is not None else item
@@ -257,8 +262,8 @@ class TrainingStep:
         Called by `run`, which decides whether it is captured, and by whoever checks it.
         """
         model, device = self._model, self.device
-        drawn = self._fed or self._sampler.draw(self._rays_per_step, self._pixel_random)
-        index, pixels, colors = drawn
+        drawn = self._fed or self._sampler.draw_batch(self._rays_per_step, self._pixel_random)
+        index, pixels, colors, plain = drawn
         rays = self._cameras.generate_rays(index, pixels)
         half = device.type == "cuda"
         # A cache of half-precision weights would outlive the graph that it was made in.
@@ -269,6 +274,10 @@ class TrainingStep:
             held = self._depth_weight, self._depth_spread
             term = self._depth.loss(outputs, rays, self._cameras, *held)
             losses = losses if term is None else {**losses, "depth": term}
+        if self._sampler.lines is not None:
+            flat = self._flat_weight
+            term = self._sampler.lines.loss(outputs, rays, self._cameras, plain, flat)
+            losses = losses if term is None else {**losses, "flat": term}
         terms = torch.stack([loss.float() for loss in losses.values()])
         self._values[: len(losses)].copy_(terms.detach())
         self._names[kind] = tuple(losses)

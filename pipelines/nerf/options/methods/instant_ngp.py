@@ -95,4 +95,6 @@ INSTANT_NGP = Method(
     summary="A hash grid and an occupancy grid; fast, best for objects and rooms.",
     config=InstantNgpConfig,
     model="pipelines.nerf.models.instant_ngp:InstantNgp",
+    # Its rays have no common samples, so that bends of lines cannot be told.
+    train={"flat": {"weight": 0.0}},
 )

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from pipelines.nerf.along_ray.losses import (
+    bend_loss,
     color_loss,
     distortion_loss,
     interlevel_loss,
@@ -242,3 +243,93 @@ def test_termination_loss_of_rays_without_any_depth_is_nothing() -> None:
     assert float(loss.detach()) == 0.0
     (gradient,) = torch.autograd.grad(loss, weights)
     assert not gradient.any()
+
+
+PER_LINE = 4
+
+
+def _lines(count: int, spacing: tuple[float, ...], seed: int) -> torch.Tensor:
+    """[4 count, 2], places in a picture at z = 1: on lines, `spacing` along each."""
+    random = torch.Generator().manual_seed(seed)
+    middle, step = torch.rand(2, count, 2, generator=random, dtype=torch.float64) - 0.5
+    return torch.cat([middle + along * step for along in spacing])
+
+
+def _on_surface(
+    places: torch.Tensor, inverse: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Weights, edges and local rays that end where 1 / z is `inverse`, all light in one sample."""
+    local = torch.cat([places, -torch.ones_like(places[:, :1])], dim=-1)
+    length = local.norm(dim=-1, keepdim=True)
+    distance = length[:, 0] / inverse
+    edges = torch.stack([0.5 * distance, 0.9 * distance, 1.1 * distance], dim=-1)
+    weights = torch.tensor([[0.0, 1.0]], dtype=torch.float64).repeat(len(places), 1)
+    return weights, edges, local / length
+
+
+EVEN, DISTORTED = (-1.0, -1 / 3, 1 / 3, 1.0), (-1.0, -0.4, 0.3, 1.1)
+
+
+@pytest.mark.parametrize("spacing", [EVEN, DISTORTED], ids=["pinhole", "distorted"])
+def test_a_plane_seen_at_a_slant_does_not_bend(spacing: tuple[float, ...]) -> None:
+    places = _lines(20, spacing, seed=1)
+    inverse = 0.8 + 0.3 * places[:, 0] - 0.2 * places[:, 1]
+    given = _on_surface(places, inverse)
+    assert float(bend_loss(*given, torch.ones(20), 1.0, 0.02)) < 1e-20
+
+
+def test_what_bends_evenly_counts_by_its_curve_alone() -> None:
+    places = _lines(20, EVEN, seed=2)
+    given = _on_surface(places, 0.8 + 0.1 * places.square().sum(dim=-1))
+    plain = torch.ones(20)
+    assert float(bend_loss(*given, plain, 0.0, 0.02)) < 1e-20
+    assert float(bend_loss(*given, plain, 0.5, 0.02)) > 1e-4
+    bumpy = _on_surface(places, 0.8 + 0.1 * torch.sin(9.0 * places[:, 0]))
+    assert float(bend_loss(*bumpy, plain, 0.0, 0.02)) > 1e-4
+
+
+def test_bend_loss_equals_the_loop() -> None:
+    count = 5
+    edges, weights = _histogram(PER_LINE * count, 7, seed=6)
+    t_edges = 0.5 + 3.0 * edges
+    places = _lines(count, EVEN, seed=3)
+    local = torch.nn.functional.normalize(
+        torch.cat([places, -torch.ones_like(places[:, :1])], dim=-1), dim=-1
+    )
+    plain = torch.tensor([1.0, 0.0, 0.3, 0.9, 1.0], dtype=torch.float64)
+    limit, curve, total = 0.05, 0.4, 0.0
+
+    def huber(off: float) -> float:
+        return 0.5 * off**2 / limit if abs(off) < limit else abs(off) - 0.5 * limit
+
+    for line in range(count):
+        q = []
+        for k in range(PER_LINE):
+            ray = k * count + line
+            middles = (t_edges[ray, 1:] + t_edges[ray, :-1]) / 2
+            q.append(float((weights[ray] / (middles * -local[ray, 2])).sum()))
+        one = q[1] - (2 / 3 * q[0] + 1 / 3 * q[3])
+        two = q[2] - (1 / 3 * q[0] + 2 / 3 * q[3])
+        unit = (q[0] + q[3]) / 2
+        bends = huber(3.0 * (one - two) / unit) + curve * huber((one + two) / unit)
+        total += float(plain[line]) * bends
+    loss = bend_loss(weights.requires_grad_(), t_edges, local, plain, curve, limit)
+    assert float(loss.detach()) == pytest.approx(total / count, rel=1e-9)
+    (gradient,) = torch.autograd.grad(loss, weights)
+    by_line = gradient.reshape(PER_LINE, count, -1).abs().sum(dim=(0, 2))
+    assert by_line[1] == 0.0
+    assert (by_line[[0, 2, 3, 4]] > 0.0).all()
+
+
+def test_lines_without_a_length_or_beside_a_fisheyes_plane_have_no_say() -> None:
+    places = _lines(3, EVEN, seed=4)
+    places[0::3] = places[0]  # the first line is one pixel, four times
+    weights, edges, local = _on_surface(places, 0.8 + 0.3 * torch.sin(5.0 * places[:, 0]))
+    local[1] = torch.tensor([0.999, 0.0, 0.04], dtype=torch.float64)  # looks backwards
+    weights.requires_grad_()
+    loss = bend_loss(weights, edges, local, torch.ones(3), 0.2, 0.02)
+    (gradient,) = torch.autograd.grad(loss, weights)
+    by_line = gradient.isfinite().all() and gradient.reshape(PER_LINE, 3, -1).abs().sum(dim=(0, 2))
+    assert by_line[0] == 0.0
+    assert by_line[1] == 0.0
+    assert by_line[2] > 0.0

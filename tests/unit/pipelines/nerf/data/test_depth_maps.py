@@ -10,8 +10,9 @@ import torch
 
 from pipelines.nerf.data.depth_maps import DepthMaps, DepthSupervision
 from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.data.plain_lines import PlainLines
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.options.train import DepthLossConfig, TrainConfig
+from pipelines.nerf.options.train import DepthLossConfig, FlatLossConfig, TrainConfig
 from pipelines.nerf.renderer import Renderer
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.training.gpu_steps import GpuSteps, StepShape
@@ -127,14 +128,18 @@ def test_maps_must_be_those_of_the_training_images() -> None:
 
 
 def test_steps_of_the_gpu_engine_learn_the_same_from_maps() -> None:
-    config = tiny_config(max_steps=8, depth=DepthLossConfig(weight=0.05))
+    config = tiny_config(
+        max_steps=8,
+        depth=DepthLossConfig(weight=0.05),
+        flat=FlatLossConfig(weight=0.05, contrast=1.0, reach=0.3),
+    )
     cameras, images = toy_cameras(6), toy_images(toy_cameras(6))
     told = DepthSupervision(exact_maps(cameras), config.depth, config.max_steps)
     shape, found = StepShape(config.rays_per_step, 1, ()), []
     for on_gpu in (False, True):
         state = initial_state(config, 6, 3, CPU)
         state.model.train()
-        sampler, losses = PixelSampler(images, range(6)), []
+        sampler, losses = PixelSampler(images, range(6), lines=PlainLines.of(config)), []
         steps = GpuSteps(state, sampler, cameras, depth=told)  # on a CPU without graphs
         for _ in range(8):
             if on_gpu:
@@ -145,7 +150,8 @@ def test_steps_of_the_gpu_engine_learn_the_same_from_maps() -> None:
                 step = optimise_once(state, sampler, cameras, config, shape, depth=told, check=True)
                 assert step is not None
                 done = step
-            losses.append(done.values["depth"])
+            losses.append(done.values)
         found.append(losses)
     assert found[0] == found[1]
-    assert found[0][-1] < found[0][0]
+    assert found[0][-1]["depth"] < found[0][0]["depth"]
+    assert found[0][0]["flat"] == 0.0 < found[0][-1]["flat"]

@@ -34,10 +34,11 @@ from pipelines.nerf.along_ray.intervals import SPACINGS
 from pipelines.nerf.data.depth_maps import DepthMaps, DepthSupervision
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.data.plain_lines import PlainLines
 from pipelines.nerf.engines.gpu.step import Kind, TrainingStep
 from pipelines.nerf.models.base import Model, StepPlan
 from pipelines.nerf.options.catalogue import find_method
-from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
 from pipelines.nerf.space.cameras import Cameras
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
@@ -137,7 +138,7 @@ def run_step(config: TrainConfig, kind: Kind, lens_name: str, *, masked: bool, b
     """One step of that kind, with depth maps where rays stand for single pixels."""
     cameras = lens(toy_cameras(6), lens_name)
     model: Model = find_method(config.method).build(config.model, 6).train()
-    sampler = PixelSampler(pictures(masked), range(6))
+    sampler = PixelSampler(pictures(masked), range(6), lines=PlainLines.of(config))
     sampler.block = block
     with FakeTensorMode() as mode:
         move_model(mode, model)
@@ -164,6 +165,7 @@ def run_step(config: TrainConfig, kind: Kind, lens_name: str, *, masked: bool, b
         with OnlyDevice():
             step.optimise(kind, StepPlan(12, exponent, update_proposals=kind.update_proposals))
         assert ("depth" in step._names[kind]) == (block == 1)
+        assert "flat" in step._names[kind]
         learned = {name for name, value in model.named_parameters() if value.grad is not None}
     assert ("proposals.0.grid.table" in learned) == kind.update_proposals
     assert ("cameras_delta.tangent" in learned) == (model.config.camera_mode != "off")
@@ -208,7 +210,7 @@ def main() -> None:
                     print(f"{name} went through")
         return
     for kind, lens_name, masked, block, options in CASES:
-        config = with_model(tiny_config(rays_per_step=RAYS), **options)
+        config = with_model(tiny_config(rays_per_step=RAYS, flat=FlatLossConfig()), **options)
         run_step(config, kind, lens_name, masked=masked, block=block)
         print(kind, lens_name, masked, block, options, flush=True)
 

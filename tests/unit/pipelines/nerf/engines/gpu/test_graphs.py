@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.data.plain_lines import PlainLines
 from pipelines.nerf.engines.gpu.step import (
     EAGER_STEPS,
     GROWTH_STEPS,
@@ -27,7 +28,7 @@ from pipelines.nerf.engines.gpu.step import (
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.options.catalogue import find_method
-from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
 from tests.unit.pipelines.nerf.engines.gpu.taped_graphs import TapedGraphs
 from tests.unit.pipelines.nerf.engines.gpu.test_step import SEED, rates_at
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
@@ -46,7 +47,7 @@ def one_thread() -> Iterator[None]:
 
 def config_of_all_kinds() -> TrainConfig:
     """The proposals learn in every second step, and the annealing ends in the middle of the run."""
-    config = tiny_config(rays_per_step=32)
+    config = tiny_config(rays_per_step=32, flat=FlatLossConfig(contrast=1.0))
     return with_model(
         config, proposal_warmup_steps=1, proposal_update_every=2, anneal_steps=ANNEALED_AT
     )
@@ -96,7 +97,7 @@ def toy(
             "cameras": adam(model.cameras_delta.parameters()),
         },
         scaler or torch.amp.GradScaler("cpu", enabled=False),
-        PixelSampler(images, range(len(cameras))),
+        PixelSampler(images, range(len(cameras)), lines=PlainLines.of(config)),
         cameras,
         config.rays_per_step,
         pixel_random=pixel_random,

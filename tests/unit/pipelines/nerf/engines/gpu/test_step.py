@@ -14,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from pipelines import nerf
 from pipelines.nerf.data.pixels import PixelSampler
+from pipelines.nerf.data.plain_lines import PlainLines
 from pipelines.nerf.engines.gpu.step import (
     LossReader,
     TrainingStep,
@@ -24,7 +25,7 @@ from pipelines.nerf.engines.gpu.step import (
 )
 from pipelines.nerf.models.base import Model, StepPlan
 from pipelines.nerf.options.catalogue import find_method
-from pipelines.nerf.options.train import TrainConfig
+from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
 from pipelines.nerf.training.loop import train
 from pipelines.nerf.training.state import learning_rate
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
@@ -63,7 +64,7 @@ def toy_step(config: TrainConfig) -> tuple[Model, TrainingStep]:
             ),
         },
         loss_scaler(CPU, config.rays_per_step),
-        PixelSampler(toy_images(cameras), range(len(cameras))),
+        PixelSampler(toy_images(cameras), range(len(cameras)), lines=PlainLines.of(config)),
         cameras,
         config.rays_per_step,
         pixel_random=torch.Generator().manual_seed(SEED),
@@ -74,7 +75,8 @@ def toy_step(config: TrainConfig) -> tuple[Model, TrainingStep]:
 
 def rare_updates(**changes: object) -> TrainConfig:
     """A run in which both kinds of steps occur, before and after the end of the annealing."""
-    config = tiny_config(rays_per_step=64, max_steps=STEPS, **changes)
+    flat = FlatLossConfig(contrast=1.0)
+    config = tiny_config(rays_per_step=64, max_steps=STEPS, flat=flat, **changes)
     return with_model(config, proposal_warmup_steps=1, proposal_update_every=3, anneal_steps=12)
 
 
