@@ -16,9 +16,9 @@ from pipelines.nerf.along_ray.intervals import bin_midpoints
 INTERLEVEL_EPS = 1e-7
 TERMINATION_FLOOR = 0.01
 """Light that ends at the known depth by chance: bounds what one wrong depth can ask for."""
-_LEAST_AHEAD, _LEAST_DISPARITY = 0.1, 1e-6
-"""Rays of a fisheye at 84 degrees to its axis, or more, have no place in a plane picture; what has
-no surface has no disparity to compare a bend with."""
+_LEAST_AHEAD, _LEAST_LIGHT, _LEAST_DISPARITY = 0.1, 1e-6, 1e-6
+"""Rays of a fisheye at 84 degrees to its axis, or more, have no place in a plane picture; the
+others keep a division by nothing from being one."""
 
 
 def color_loss(predicted: Tensor, truth: Tensor) -> Tensor:
@@ -106,11 +106,14 @@ def bend_loss(
 ) -> Tensor:
     """Penalty on bumps of plain surfaces, by lines of four rays in one picture; a scalar.
 
-    (1/L) sum_l p_l (h(3 (r_1 - r_2)) + c h(r_1 + r_2)) over L lines, where r_1 and r_2 are how far
-    the disparities of the inner rays are from the straight line between those of the ends, relative
-    to these: what bends evenly has no first term, what is plane none at all. A ray's disparity is
-    sum_i w_i / z_i, which on a plane is linear in the picture. h is Huber's function,
-    b^2 / (2 limit) up to the limit.
+    (1/L) sum_l p_l o_l (h(3 (r_1 - r_2)) + c h(r_1 + r_2)) over L lines, where r_1 and r_2 are how
+    far the disparities of the inner rays are from the straight line between those of the ends,
+    relative to these: what bends evenly has no first term, what is plane none at all. A ray's
+    disparity is the mean of 1 / z over the light that ends on it, (sum_i w_i / z_i) / sum_i w_i,
+    which on a plane is linear in the picture. o is how much light ends on the least of a line's
+    rays, taken as a constant: what lets all light through is no surface yet, and to let it through
+    is no way to be even. h(b) = b^2 / (2 limit) / (1 + b^2 / (2 limit)^2) lets go of what bends by
+    many limits, which is an edge.
     weights: [4 L, S], of the rays at each place along the lines together, in their order. t_edges:
     [4 L, S + 1], scene units. local: [4 L, 3], unit, the rays in the camera's axes (it looks along
     -Z). plain: [L] in [0, 1]. curve: c.
@@ -121,7 +124,10 @@ def bend_loss(
     ahead = -local[:, 2]
     usable = ahead > _LEAST_AHEAD
     safe = torch.where(usable, ahead, 1.0)[:, None]
-    disparity = (weights / bin_midpoints(t_edges)).sum(dim=-1) / safe[:, 0]
+    light = weights.sum(dim=-1)
+    disparity = (weights / bin_midpoints(t_edges)).sum(dim=-1) / light.clamp_min(_LEAST_LIGHT)
+    disparity = disparity / safe[:, 0]
+    ended = torch.stack(light.detach().chunk(4)).amin(dim=0)
     start, first, second, end = disparity.chunk(4)
     origin, *inner, far = (local[:, :2] / safe).chunk(4)
     along = far - origin
@@ -134,14 +140,15 @@ def bend_loss(
 
     unit = (0.5 * (start + end)).detach().clamp_min(_LEAST_DISPARITY)
     one, two = beside(first, inner[0]) / unit, beside(second, inner[1]) / unit
-    penalty = _huber(3.0 * (one - two), limit) + curve * _huber(one + two, limit)
+    penalty = _forgiving(3.0 * (one - two), limit) + curve * _forgiving(one + two, limit)
     counts = is_line & torch.stack(usable.chunk(4)).all(dim=0)
-    return torch.where(counts, plain * penalty, 0.0).mean()
+    return torch.where(counts, plain * ended * penalty, 0.0).mean()
 
 
-def _huber(off: Tensor, limit: float) -> Tensor:
-    size = off.abs()
-    return torch.where(size < limit, 0.5 * off.square() / limit, size - 0.5 * limit)
+def _forgiving(off: Tensor, limit: float) -> Tensor:
+    """Geman and McClure's function: a square for what is small, a constant for what is large."""
+    square = off.square()
+    return 0.5 * square / limit / (1.0 + 0.25 * square / limit**2)
 
 
 def orientation_loss(weights: Tensor, normals: Tensor, directions: Tensor) -> Tensor:

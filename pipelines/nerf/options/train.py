@@ -124,8 +124,8 @@ class FlatLossConfig:
     )
     limit: float = option(
         0.02,
-        "Bend, relative to the depth, from which on it counts by itself and no longer by its "
-        "square: an edge is no bend.",
+        "Bend, relative to the depth, up to which it counts by its square; by many times that it "
+        "counts no more: an edge is no bend.",
         ge=1e-4,
         le=1.0,
     )

@@ -299,26 +299,45 @@ def test_bend_loss_equals_the_loop() -> None:
     plain = torch.tensor([1.0, 0.0, 0.3, 0.9, 1.0], dtype=torch.float64)
     limit, curve, total = 0.05, 0.4, 0.0
 
-    def huber(off: float) -> float:
-        return 0.5 * off**2 / limit if abs(off) < limit else abs(off) - 0.5 * limit
+    def forgiving(off: float) -> float:
+        return 0.5 * off**2 / limit / (1.0 + (off / (2.0 * limit)) ** 2)
 
     for line in range(count):
-        q = []
+        q, least = [], math.inf
         for k in range(PER_LINE):
             ray = k * count + line
             middles = (t_edges[ray, 1:] + t_edges[ray, :-1]) / 2
-            q.append(float((weights[ray] / (middles * -local[ray, 2])).sum()))
+            ended = float(weights[ray].sum())
+            q.append(float((weights[ray] / (middles * -local[ray, 2])).sum()) / ended)
+            least = min(least, ended)
         one = q[1] - (2 / 3 * q[0] + 1 / 3 * q[3])
         two = q[2] - (1 / 3 * q[0] + 2 / 3 * q[3])
         unit = (q[0] + q[3]) / 2
-        bends = huber(3.0 * (one - two) / unit) + curve * huber((one + two) / unit)
-        total += float(plain[line]) * bends
+        bends = forgiving(3.0 * (one - two) / unit) + curve * forgiving((one + two) / unit)
+        total += float(plain[line]) * least * bends
     loss = bend_loss(weights.requires_grad_(), t_edges, local, plain, curve, limit)
     assert float(loss.detach()) == pytest.approx(total / count, rel=1e-9)
     (gradient,) = torch.autograd.grad(loss, weights)
     by_line = gradient.reshape(PER_LINE, count, -1).abs().sum(dim=(0, 2))
     assert by_line[1] == 0.0
     assert (by_line[[0, 2, 3, 4]] > 0.0).all()
+
+
+def test_no_light_is_let_through_for_evenness() -> None:
+    """A run on white walls once became all transparent: 1 / z of no light is 0, and even."""
+    edges, weights = _histogram(PER_LINE * 6, 7, seed=8)
+    places = _lines(6, EVEN, seed=5)
+    local = torch.nn.functional.normalize(
+        torch.cat([places, -torch.ones_like(places[:, :1])], dim=-1), dim=-1
+    )
+    for scale in (1.0, 1e-3, 1e-9):
+        thin = (scale * weights).requires_grad_()
+        loss = bend_loss(thin, 0.5 + 3.0 * edges, local, torch.ones(6), 0.4, 0.05)
+        (gradient,) = torch.autograd.grad(loss, thin)
+        assert gradient.abs().max() < 10.0
+        if scale > 1e-6:
+            more_or_less = (gradient * thin.detach()).sum(dim=-1).abs()
+            assert float(more_or_less.max()) < 1e-12
 
 
 def test_lines_without_a_length_or_beside_a_fisheyes_plane_have_no_say() -> None:
