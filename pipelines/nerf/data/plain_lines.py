@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pipelines.nerf.along_ray.losses import bend_loss
+from pipelines.nerf.data.depth_maps import DepthMaps
 from pipelines.nerf.models.base import Outputs
 from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
 from pipelines.nerf.space.cameras import Cameras
@@ -49,11 +50,13 @@ class PlainLines:
         cameras: Cameras,
         plain: Tensor,
         weight: float | Tensor,
+        maps: DepthMaps | None = None,
     ) -> Tensor | None:
         """The weighted term of a step; None without lines, and for methods whose rays have no
         common samples.
 
-        rays: of a batch of `PixelSampler.draw_batch`, plain: [L] of it. weight: of `weight`.
+        rays: of a batch of `PixelSampler.draw_batch`, plain: [L] of it. weight: of `weight`. maps:
+        where they know both inner rays of a line, it is left out: nobody need guess there.
         """
         num_rays = PER_LINE * len(plain)
         if not outputs["weights"] or num_rays == 0:
@@ -61,5 +64,8 @@ class PlainLines:
         found, edges = outputs["weights"][-1], outputs["samples"][-1].t_edges
         turn = cameras.scene_from_camera[rays.camera_indices[:num_rays], :, :3]
         local = torch.einsum("rij,ri->rj", turn, rays.directions[:num_rays])
+        if maps is not None:
+            known = maps.distances(rays, cameras)[:num_rays].reshape(PER_LINE, -1) > 0.0
+            plain = torch.where(known[1:-1].all(dim=0), 0.0, plain)
         given = found[:num_rays], edges[:num_rays], local, plain
         return weight * bend_loss(*given, self.config.curve, self.config.limit)

@@ -102,18 +102,18 @@ class DepthLossConfig:
 class FlatLossConfig:
     """Plain surfaces have no bumps: lines of evenly coloured pixels as one more thing to fit.
 
-    Nothing else tells their depth, so that they may bend, but not unevenly. See
+    Where depth maps know nothing nothing tells their depth: they may bend, but not unevenly. See
     `along_ray.losses.bend_loss`.
     """
 
     weight: float = option(
-        0.05,
+        0.2,
         "Weight of how unevenly such lines bend; 0 leaves it out.",
         ge=0.0,
         le=10.0,
     )
     curve: float = option(
-        0.2, "Weight, beside that, of how much they bend at all.", ge=0.0, le=10.0
+        0.1, "Weight, beside that, of how much they bend at all.", ge=0.0, le=10.0
     )
     share: float = option(0.2, "Share of the rays that lie on lines, four on each.", ge=0.0, le=1.0)
     reach: float = option(

@@ -232,7 +232,8 @@ def optimise_once(
         losses = losses if term is None else {**losses, "depth": term}
     if sampler.lines is not None:
         weight = sampler.lines.weight(state.step)
-        term = sampler.lines.loss(outputs, rays, cameras, plain, weight)
+        maps = None if depth is None else depth.maps
+        term = sampler.lines.loss(outputs, rays, cameras, plain, weight, maps)
         losses = losses if term is None else {**losses, "flat": term}
     values = _checked_values(losses, state.step) if check else {}
     scale = state.scaler.get_scale() if check and state.scaler.is_enabled() else None

@@ -275,8 +275,9 @@ class TrainingStep:
             term = self._depth.loss(outputs, rays, self._cameras, *held)
             losses = losses if term is None else {**losses, "depth": term}
         if self._sampler.lines is not None:
-            flat = self._flat_weight
-            term = self._sampler.lines.loss(outputs, rays, self._cameras, plain, flat)
+            maps = None if self._depth is None else self._depth.maps
+            given = outputs, rays, self._cameras, plain, self._flat_weight, maps
+            term = self._sampler.lines.loss(*given)
             losses = losses if term is None else {**losses, "flat": term}
         terms = torch.stack([loss.float() for loss in losses.values()])
         self._values[: len(losses)].copy_(terms.detach())

@@ -352,3 +352,34 @@ def test_lines_without_a_length_or_beside_a_fisheyes_plane_have_no_say() -> None
     assert by_line[0] == 0.0
     assert by_line[1] == 0.0
     assert by_line[2] > 0.0
+
+
+def test_a_bump_on_a_plain_wall_is_learnt_away_and_an_edge_is_not() -> None:
+    places = _lines(12, EVEN, seed=7)
+    local = torch.nn.functional.normalize(
+        torch.cat([places, -torch.ones_like(places[:, :1])], dim=-1), dim=-1
+    )
+    inverse = 0.8 + 0.1 * places[:, 0]
+    inner = torch.arange(PER_LINE * 12) // 12 == 1
+    edges = torch.linspace(0.4, 3.0, 131, dtype=torch.float64).repeat(len(places), 1)
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2
+
+    def learnt(step: float) -> torch.Tensor:
+        """How far the inner rays, which were off by `step`, are from the wall in the end."""
+        began = inverse * torch.where(inner, 1.0 + step, 1.0)
+        distance = 1.0 / (began * -local[:, 2])
+        logits = -0.5 * ((middles - distance[:, None]) / 0.04).square()
+        moved = logits.clone().requires_grad_()
+        adam = torch.optim.Adam([moved], lr=0.05)
+        for _ in range(300):
+            adam.zero_grad()
+            weights = torch.where(inner[:, None], moved, logits).softmax(dim=-1)
+            bend_loss(weights, edges, local, torch.ones(12), 0.1, 0.02).backward()
+            adam.step()
+        with torch.no_grad():
+            weights = torch.where(inner[:, None], moved, logits).softmax(dim=-1)
+            found = (weights / middles).sum(dim=-1) / -local[:, 2]
+        return (found / inverse - 1.0)[inner].abs()
+
+    assert float(learnt(0.01).max()) < 0.004
+    assert float(learnt(0.6).min()) > 0.4

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
+from pipelines.nerf.data.depth_maps import DepthMaps
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.data.pixels import Batch, PixelSampler
 from pipelines.nerf.data.plain_lines import PER_LINE, PlainLines
-from pipelines.nerf.options.train import FlatLossConfig
-from pipelines.nerf.renderer import Renderer
-from pipelines.nerf.space.cameras import SceneTransform
-from pipelines.nerf.training.loop import train
-from tests.unit.pipelines.nerf.toy_scene import SIZE, tiny_config, toy_cameras, toy_color
+from pipelines.nerf.options.train import FlatLossConfig, default_train_config
+from tests.unit.pipelines.nerf.toy_scene import SIZE, toy_cameras
 
 COUNT = 1200
 LINES = PlainLines(FlatLossConfig(share=1.0, reach=0.3), 100)
@@ -105,28 +106,42 @@ def test_weight_rises_over_the_first_fifth_of_the_run() -> None:
     assert [lines.weight(step) for step in (0, 100, 200, 900)] == pytest.approx([0, 0.15, 0.3, 0.3])
 
 
-def roughness(weight: float) -> float:
-    """How unevenly the learnt depth of a plain white ball bends, in the mean of some lines."""
-    cameras = toy_cameras(12)
-    pictures = []
-    for index in range(len(cameras)):
-        colors, distance = toy_color(cameras.image_rays(index))
-        colors = torch.where(distance.isfinite()[:, None], 0.9, colors)
-        pictures.append((colors.reshape(SIZE, SIZE, 3) * 255).round().byte().numpy())
-    flat = FlatLossConfig(weight=weight, reach=0.2)
-    config = tiny_config(max_steps=160, flat=flat)
-    model = train(ImageData.from_arrays(pictures), cameras, range(12), config, seed=1)
-    found = []
-    for index in range(len(cameras)):
-        seen = Renderer(model, SceneTransform((0.0, 0.0, 0.0), 1.0)).render(cameras, index)
-        _, truth = toy_color(cameras.image_rays(index))
-        on_ball = truth.isfinite().reshape(SIZE, SIZE).numpy()
-        q = 1.0 / np.asarray(seen.depth, np.float64).reshape(SIZE, SIZE)
-        bends = np.abs(q[:, 3:] - 3 * q[:, 2:-1] + 3 * q[:, 1:-2] - q[:, :-3])
-        inside = np.lib.stride_tricks.sliding_window_view(on_ball, 4, axis=1).all(axis=-1)
-        found.append(bends[inside])
-    return float(np.concatenate(found).mean())
+def test_lines_whose_depth_is_known_are_left_out() -> None:
+    cameras, count = toy_cameras(2), 8
+    share = torch.tensor([-1.0, -1 / 3, 1 / 3, 1.0])[:, None, None]
+    random = torch.Generator().manual_seed(0)
+    middle = torch.rand(count, 2, generator=random) * 6 + 13
+    pixels = (middle + share * torch.tensor([6.0, 3.0])).reshape(-1, 2)
+    index = torch.zeros(len(pixels), dtype=torch.int64)
+    rays = cameras.generate_rays(index, pixels)
+    edges = torch.linspace(0.5, 2.0, 9).repeat(len(pixels), 1)
+    weights = torch.rand(len(pixels), 8, generator=random)
+    samples = SimpleNamespace(t_edges=edges)
+    outputs: Any = {"weights": [weights], "samples": [samples]}
+    plain, lines = torch.ones(count), PlainLines(FlatLossConfig(), 100)
+
+    def found(known: np.ndarray) -> float:
+        lens = (28.0, 28.0, SIZE / 2, SIZE / 2)
+        maps = DepthMaps.from_arrays([known.astype(np.float32)] * 2, [lens] * 2, 1.0)
+        term = lines.loss(outputs, rays, cameras, plain, 1.0, maps)
+        assert term is not None
+        return float(term)
+
+    everywhere = lines.loss(outputs, rays, cameras, plain, 1.0)
+    assert everywhere is not None
+    nowhere = np.zeros((SIZE, SIZE))
+    assert found(nowhere) == float(everywhere) > 0.0
+    assert found(nowhere + 1.0) == 0.0
+    ends = nowhere.copy()  # what both ends know says nothing of the middle
+    for x, y in pixels.reshape(4, count, 2)[[0, 3]].reshape(-1, 2).tolist():
+        ends[int(y), int(x)] = 1.0
+    assert found(ends) == float(everywhere)
 
 
-def test_a_plain_ball_gets_smoother() -> None:
-    assert roughness(0.3) < 0.7 * roughness(0.0)
+def test_methods_without_common_samples_have_no_such_term() -> None:
+    cameras = toy_cameras(2)
+    rays = cameras.generate_rays(torch.zeros(4, dtype=torch.int64), torch.full((4, 2), 9.5))
+    outputs: Any = {"weights": [], "samples": []}
+    assert LINES.loss(outputs, rays, cameras, torch.ones(1), 1.0) is None
+    assert default_train_config("instant-ngp").flat.weight == 0.0
+    assert PlainLines.of(default_train_config("instant-ngp")) is None
