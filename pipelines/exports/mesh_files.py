@@ -19,9 +19,10 @@ from pipelines.exports.mesh_options import Format, MeshOptions
 from pipelines.exports.mesh_shape import REDUCE_SHARE, Part
 from pipelines.exports.placement import Placement
 from pipelines.exports.subject import Thing
-from pipelines.exports.subject_files import gaze_of, save_subject
+from pipelines.exports.subject_files import save_subject
 from pipelines.exports.texture.bake import painted
 from pipelines.exports.texture.told import skin_told
+from pipelines.scene.gaze import gaze_of
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
 

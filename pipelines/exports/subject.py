@@ -17,7 +17,6 @@ in a constant's name is of the cameras' mean distance to the focus, which is `di
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -29,16 +28,12 @@ from scipy import ndimage
 from pipelines.exports.crop import Crop
 from pipelines.exports.surface.supports import CELLS, Cells, Plane, cells_of, patch_under, planes_of
 from pipelines.scene.depth_views import Pinhole
-from pipelines.scene.focus import find_focus
+from pipelines.scene.gaze import Gaze, told_by_cameras
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Kind = Literal["subject", "scene"]
 
-LEAST_LOOKING = 0.75
-"""Of the cameras, that have the focus within 30 degrees of their axis."""
-LEAST_ARC_DEG = 40.0
-"""Between the two cameras that see the focus from the most different directions."""
 LEAST_NEAR = 0.5
 """Of what the middles of the pictures show, that is within half of the distance of the focus."""
 LEAST_STANDING = 0.01
@@ -46,7 +41,6 @@ LEAST_STANDING = 0.01
 MOST_CROWD = 0.5
 """How densely what stands may go on around it."""
 
-_MIDDLE = 0.8
 _LONG_SIDE_PX = 48
 _LEAST_HITS = 0.25
 _LOOKED_AT, _ENDS = 0.5, 0.25
@@ -68,26 +62,6 @@ _AROUND = np.ones((3, 3), bool)
 
 _core: Any = open3d.core
 _geometry: Any = open3d.t.geometry
-
-
-@dataclass(frozen=True)
-class Gaze:
-    """Who looked. poses: [N, 3, 4] world_from_camera, OpenGL axes. lenses: N, undistorted."""
-
-    poses: Floats
-    lenses: Sequence[Pinhole]
-
-    def attention(self, points: Floats) -> Floats:
-        """[P] in [0, 1], the share of cameras with points [P, 3] amid their pictures."""
-        count = np.zeros(len(points))
-        for pose, lens in zip(self.poses, self.lenses, strict=True):
-            local = (points - pose[:, 3]) @ pose[:, :3]
-            before = -local[:, 2] > 0.0
-            depth = np.where(before, -local[:, 2], 1.0)
-            x = np.abs(lens.fl_x * local[:, 0]) / depth / (0.5 * lens.width)
-            y = np.abs(lens.fl_y * local[:, 1]) / depth / (0.5 * lens.height)
-            count += before & (x < _MIDDLE) & (y < _MIDDLE)
-        return count / max(len(self.poses), 1)
 
 
 @dataclass(frozen=True)
@@ -153,16 +127,6 @@ class Decision:
     thing: Thing | None = None
 
 
-@dataclass(frozen=True)
-class Told:
-    """What cameras alone say. why: they did not walk round anything; None where they may have.
-    where: the focus [3] and their mean distance to it, if they have one."""
-
-    why: str | None
-    measures: dict[str, Any] = field(default_factory=dict)
-    where: tuple[Floats, float] | None = None
-
-
 def find_subject(
     vertices: Floats,
     faces: NDArray[np.integer[Any]],
@@ -195,31 +159,6 @@ def find_subject(
     if why is not None:
         return Decision("scene", why, measures, thing)
     return Decision("subject", "The cameras stand around a thing and look at it.", measures, thing)
-
-
-def told_by_cameras(gaze: Gaze) -> Told:
-    """What cameras alone say, before anything is known of what they saw."""
-    focus = find_focus(gaze.poses) if len(gaze.poses) >= 3 else None
-    if focus is None:
-        return Told("The cameras do not look at one point: they face one way, or look about.")
-    away = gaze.poses[:, :, 3] - focus
-    far = np.linalg.norm(away, axis=1)
-    toward = -away / np.maximum(far[:, None], 1e-300)
-    cosine = -(gaze.poses[:, :, 2] * toward).sum(axis=1)
-    looking = float((cosine > np.cos(np.radians(30.0))).mean())
-    arc = float(np.degrees(np.arccos(np.clip((toward @ toward.T).min(), -1.0, 1.0))))
-    where = focus, float(far.mean())
-    measures = {
-        "looking": round(looking, 3),
-        "arc_deg": round(arc, 1),
-        "distance": round(where[1], 6),
-    }
-    why = None
-    if looking < LEAST_LOOKING:
-        why = f"Only {looking:.0%} of the cameras look at what the others do."
-    elif arc < LEAST_ARC_DEG:
-        why = f"The cameras see it from directions within {arc:.0f} degrees."
-    return Told(why, measures, where)
 
 
 def _near_share(

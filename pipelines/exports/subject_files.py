@@ -18,20 +18,12 @@ from pipelines.exports.formats import glb
 from pipelines.exports.formats.glb import GlbStyle
 from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, shifted
-from pipelines.exports.subject import Decision, Gaze, Thing
+from pipelines.exports.subject import Decision, Thing
 from pipelines.exports.subject_picture import save_subject_picture
-from pipelines.scene.cameras_file import Intrinsics, PosedImage
-from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.gaze import Gaze
 
 SUBJECT, PICTURE = "subject.glb", "subject.jpg"
 _WORLD = "the world of cameras.json moved: the origin is under the subject"
-_LONG_SIDE_PX = 64
-
-
-def gaze_of(images: list[PosedImage], lenses: list[Intrinsics]) -> Gaze:
-    """The cameras of a capture as the rule wants them."""
-    poses = np.asarray([image.world_from_camera for image in images], np.float64).reshape(-1, 3, 4)
-    return Gaze(poses, [Pinhole.of(lens, _LONG_SIDE_PX) for lens in lenses])
 
 
 def save_subject(

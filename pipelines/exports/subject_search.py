@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.exports.subject import Decision, Gaze, find_subject, told_by_cameras
-from pipelines.exports.subject_files import gaze_of
+from pipelines.exports.subject import Decision, find_subject
 from pipelines.exports.surface.shells import Subject, find_shells, fuse_shells
 from pipelines.exports.surface.views import known_depths, render_views
 from pipelines.scene.bounds import bounds_of_views
 from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.gaze import Gaze, gaze_of, told_by_cameras
 
 if TYPE_CHECKING:
     from pipelines.scene.depth_views import DepthView, ViewStore

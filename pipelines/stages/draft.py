@@ -23,7 +23,7 @@ from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import reach_of
 from pipelines.exports.subject import Decision
-from pipelines.exports.subject_files import as_dict, gaze_of
+from pipelines.exports.subject_files import as_dict
 from pipelines.exports.subject_search import decide_on
 from pipelines.exports.surface.shells import find_shells, fuse_shells
 from pipelines.exports.texture.bake import painted
@@ -34,6 +34,7 @@ from pipelines.scene.bounds import bounds_of_views
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_views import DepthView, Floats, Pinhole, ViewStore
+from pipelines.scene.gaze import gaze_of
 from pipelines.scene.stereo_views import undistorted_picture
 from pipelines.stage import StageContext
 

@@ -38,6 +38,7 @@ from pipelines.option_models import StageOptions
 from pipelines.options import resolve_options, stage_options, train_config
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsFile
+from pipelines.scene.gaze import gaze_of, told_by_cameras
 from pipelines.scene.natural_order import natural_key
 from pipelines.scene.trained_scene import (
     as_uint8,
@@ -77,6 +78,7 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         _compile_kernels(config, ctx)
         ctx.progress(0.0, "loading images")
         inputs = _load(config, ctx)
+        config = decided(config, inputs.capture)
         watcher = _Watcher(inputs, ctx)
         model = _train(inputs, config, ctx, watcher)
     ctx.progress(_TRAIN_SHARE, "saving the model")
@@ -98,8 +100,19 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         "width": width,
         "height": height,
         "device": next(model.parameters()).device.type,
+        "plain_lines": config.flat.when == "always",
         "camera_deltas": deltas,
     }
+
+
+def decided(config: TrainConfig, capture: CamerasFile) -> TrainConfig:
+    """The run with what is to be decided by how the capture was filmed."""
+    if config.flat.when != "around":
+        return config
+    shown = [image for image in capture.images if image.split == "train"]
+    gaze = gaze_of(shown, [capture.cameras[image.camera] for image in shown])
+    when = "always" if told_by_cameras(gaze).why is None else "never"
+    return replace(config, flat=replace(config.flat, when=when))
 
 
 def preload() -> None:

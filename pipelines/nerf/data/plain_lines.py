@@ -32,8 +32,9 @@ class PlainLines:
 
     @classmethod
     def of(cls, config: TrainConfig) -> PlainLines | None:
-        """Those of a run; None where its options want none."""
-        return cls(config.flat, config.max_steps) if config.flat.weight > 0.0 else None
+        """Those of a run; None unless its options want them always."""
+        wanted = config.flat.when == "always" and config.flat.weight > 0.0
+        return cls(config.flat, config.max_steps) if wanted else None
 
     def count(self, num_rays: int) -> int:
         """Lines among so many rays."""

@@ -106,6 +106,12 @@ class FlatLossConfig:
     `along_ray.losses.bend_loss`.
     """
 
+    when: str = option(
+        "around",
+        "around: where the cameras stand around what they look at, by the rule for subjects; the "
+        "library alone, which does not know that, takes it for never.",
+        choices=("around", "always", "never"),
+    )
     weight: float = option(
         0.2,
         "Weight of how unevenly such lines bend; 0 leaves it out.",

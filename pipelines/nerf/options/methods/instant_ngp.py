@@ -96,5 +96,5 @@ INSTANT_NGP = Method(
     config=InstantNgpConfig,
     model="pipelines.nerf.models.instant_ngp:InstantNgp",
     # Its rays have no common samples, so that bends of lines cannot be told.
-    train={"flat": {"weight": 0.0}},
+    train={"flat": {"when": "never"}},
 )

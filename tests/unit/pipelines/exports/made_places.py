@@ -8,8 +8,8 @@ import numpy as np
 
 from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.paths.flight import looking_at
-from pipelines.exports.subject import Gaze
 from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.gaze import Gaze
 
 Corner = Sequence[float] | np.ndarray
 STEP = 0.04

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from pipelines.exports.mesh import TriangleMesh, joined
-from pipelines.exports.subject import Decision, Gaze, find_subject
+from pipelines.exports.subject import Decision, find_subject
 from pipelines.sample.film import phone_camera, walk
 from pipelines.sample.scene import depth_image, pose_matrix
 from pipelines.sample.scenes.catalogue import TAKES
 from pipelines.scene.depth_views import DepthView, Pinhole
+from pipelines.scene.gaze import Gaze
 from tests.unit.pipelines.exports.made_places import around, block, seen_from, sheet, table
 
 THING = ((-0.2, -0.15, 0.0), (0.2, 0.15, 0.3))

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from pipelines.exports import subject
 from pipelines.exports.subject_files import as_dict
 from pipelines.exports.subject_search import search_subject
 from pipelines.manifest import RunHooks
 from pipelines.nerf.options.render import RenderConfig
+from pipelines.scene import gaze
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
 from pipelines.workspace import Workspace
@@ -65,7 +65,7 @@ def test_what_rendering_leaves_out_decides_nothing(job: Workspace, tmp_path: Pat
 def test_what_is_cropped_and_what_is_kept_is_sought_once(
     job: Workspace, monkeypatch: pytest.MonkeyPatch, kind: str, changes: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr(subject, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
+    monkeypatch.setattr(gaze, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
     both = {"crop": {"shape": "auto"}, "extent": "subject"}
     made, said = _made(job, kind, **both, **changes)
     assert _searches(said) == 1
@@ -78,7 +78,7 @@ def test_what_is_cropped_and_what_is_kept_is_sought_once(
 def test_nothing_is_rendered_where_the_cameras_tell_it_by_themselves(
     job: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(subject, "LEAST_ARC_DEG", 400.0)
+    monkeypatch.setattr(gaze, "LEAST_ARC_DEG", 400.0)
     made, said = _made(job, "mesh", **FAST)
     assert _searches(said) == 0
     assert made["subject"]["kind"] == "scene"

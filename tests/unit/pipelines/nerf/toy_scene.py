@@ -13,7 +13,7 @@ from torch import Tensor
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, ProposalConfig
 from pipelines.nerf.options.parts import HashGridConfig
-from pipelines.nerf.options.train import DataConfig, FlatLossConfig, OptimizerConfig, TrainConfig
+from pipelines.nerf.options.train import DataConfig, OptimizerConfig, TrainConfig
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.space.rays import Rays
 
@@ -96,8 +96,6 @@ def tiny_config(**changes: object) -> TrainConfig:
         "engine": "plain",
         "model": tiny_model(),
         "data": DataConfig(long_side_px=SIZE),
-        # The ball is eight pixels wide and round: no plain surface to be kept from bumps.
-        "flat": FlatLossConfig(weight=0.0),
         "optimizer": OptimizerConfig(decay_steps=1000),
     }
     return TrainConfig(**{**values, **changes})  # type: ignore[arg-type]

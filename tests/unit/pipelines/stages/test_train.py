@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,11 @@ from PIL import Image
 
 from pipelines.errors import Cancelled, TrainingError
 from pipelines.manifest import RunHooks
+from pipelines.nerf.options.train import default_train_config
 from pipelines.nerf.training.checkpoint import load_checkpoint, load_model
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.trained_scene import TrainedScene
+from pipelines.stages.train import decided
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -26,6 +29,33 @@ def test_summary_says_what_was_trained(trained_job: Workspace) -> None:
     assert summary["train_psnr"] > 9.0
     assert set(summary["losses"]) >= {"rgb", "interlevel", "distortion", "camera"}
     assert summary["camera_deltas"]["max_translation"] > 0.0
+
+
+def test_plain_lines_are_for_cameras_that_stand_around_what_they_look_at(
+    trained_job: Workspace,
+) -> None:
+    around = CamerasFile.load(trained_job.stage("train") / "cameras.json")
+    backwards = np.diag([-1.0, 1.0, -1.0, 1.0])
+    outwards = replace(
+        around,
+        images=tuple(
+            replace(
+                image,
+                world_from_camera=tuple(
+                    map(tuple, (np.asarray(image.world_from_camera) @ backwards).tolist())
+                ),
+            )
+            for image in around.images
+        ),
+    )
+    config = default_train_config("nerfacto")
+    assert config.flat.when == "around"
+    assert decided(config, around).flat == replace(config.flat, when="always")
+    assert decided(config, outwards).flat == replace(config.flat, when="never")
+    assert trained_job.manifest("train")["summary"]["plain_lines"] is True
+    for told in ("always", "never"):
+        asked = replace(config, flat=replace(config.flat, when=told))
+        assert decided(asked, outwards) == decided(asked, around) == asked
 
 
 def test_model_holds_all_that_rendering_needs(trained_job: Workspace, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from pipelines.errors import Cancelled, ExportError
-from pipelines.exports import mesh_shape, subject
+from pipelines.exports import mesh_shape
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
@@ -23,6 +23,7 @@ from pipelines.exports.texture import charts
 from pipelines.judging.asset_views import Texture
 from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
+from pipelines.scene import gaze
 from pipelines.workspace import Workspace
 from tests.gltf_validator import problems_of
 from tests.unit.pipelines.stages import tiny_job
@@ -93,7 +94,7 @@ def test_the_method_is_that_of_how_the_cameras_stand(
     crop = {"shape": "sphere", "center": (0.0, 0.0, 0.0), "size": (4.0, 4.0, 4.0)}
     for asked in ({}, {"extent": "scene"}, {"crop": crop}):
         assert tiny_job.run(job, "mesh", **plain, **asked)["summary"]["method"] == "poisson", asked
-    monkeypatch.setattr(subject, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
+    monkeypatch.setattr(gaze, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
     assert tiny_job.run(job, "mesh", **plain)["summary"]["method"] == "tsdf"
     assert tiny_job.run(job, "mesh", method="poisson", **plain)["summary"]["method"] == "poisson"
 

@@ -131,7 +131,7 @@ def test_steps_of_the_gpu_engine_learn_the_same_from_maps() -> None:
     config = tiny_config(
         max_steps=8,
         depth=DepthLossConfig(weight=0.05),
-        flat=FlatLossConfig(weight=0.05, share=1.0, contrast=1.0, reach=0.3),
+        flat=FlatLossConfig("always", weight=0.05, share=1.0, contrast=1.0, reach=0.3),
     )
     cameras, images = toy_cameras(6), toy_images(toy_cameras(6))
     told = DepthSupervision(exact_maps(cameras), config.depth, config.max_steps)

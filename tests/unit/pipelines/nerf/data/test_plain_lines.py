@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -143,5 +144,13 @@ def test_methods_without_common_samples_have_no_such_term() -> None:
     rays = cameras.generate_rays(torch.zeros(4, dtype=torch.int64), torch.full((4, 2), 9.5))
     outputs: Any = {"weights": [], "samples": []}
     assert LINES.loss(outputs, rays, cameras, torch.ones(1), 1.0) is None
-    assert default_train_config("instant-ngp").flat.weight == 0.0
+    assert default_train_config("instant-ngp").flat.when == "never"
     assert PlainLines.of(default_train_config("instant-ngp")) is None
+
+
+def test_the_library_alone_takes_lines_only_where_they_are_always_wanted() -> None:
+    config = default_train_config("nerfacto")
+    assert PlainLines.of(config) is None  # "around": whoever knows the cameras decides
+    always = replace(config, flat=FlatLossConfig("always"))
+    assert PlainLines.of(always) == PlainLines(always.flat, config.max_steps)
+    assert PlainLines.of(replace(config, flat=FlatLossConfig("always", weight=0.0))) is None

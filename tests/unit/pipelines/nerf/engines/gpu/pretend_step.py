@@ -210,7 +210,9 @@ def main() -> None:
                     print(f"{name} went through")
         return
     for kind, lens_name, masked, block, options in CASES:
-        config = with_model(tiny_config(rays_per_step=RAYS, flat=FlatLossConfig()), **options)
+        config = with_model(
+            tiny_config(rays_per_step=RAYS, flat=FlatLossConfig("always")), **options
+        )
         run_step(config, kind, lens_name, masked=masked, block=block)
         print(kind, lens_name, masked, block, options, flush=True)
 

@@ -47,7 +47,7 @@ def one_thread() -> Iterator[None]:
 
 def config_of_all_kinds() -> TrainConfig:
     """The proposals learn in every second step, and the annealing ends in the middle of the run."""
-    config = tiny_config(rays_per_step=32, flat=FlatLossConfig(contrast=1.0))
+    config = tiny_config(rays_per_step=32, flat=FlatLossConfig("always", contrast=1.0))
     return with_model(
         config, proposal_warmup_steps=1, proposal_update_every=2, anneal_steps=ANNEALED_AT
     )

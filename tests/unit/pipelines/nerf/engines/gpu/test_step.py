@@ -75,7 +75,7 @@ def toy_step(config: TrainConfig) -> tuple[Model, TrainingStep]:
 
 def rare_updates(**changes: object) -> TrainConfig:
     """A run in which both kinds of steps occur, before and after the end of the annealing."""
-    flat = FlatLossConfig(contrast=1.0)
+    flat = FlatLossConfig("always", contrast=1.0)
     config = tiny_config(rays_per_step=64, max_steps=STEPS, flat=flat, **changes)
     return with_model(config, proposal_warmup_steps=1, proposal_update_every=3, anneal_steps=12)
 
