@@ -136,4 +136,6 @@ def write_subject(
 
 def _style(options: MeshOptions) -> GlbStyle:
     """How GLB files are written."""
-    return GlbStyle(options.glb_unlit, options.glb_quantized, options.glb_compressed)
+    return GlbStyle(
+        options.glb_unlit, options.glb_quantized, options.glb_compressed, options.glb_texture
+    )

@@ -141,6 +141,14 @@ class MeshOptions(CropOptions, TextureOptions):
         "have one, to be switched on.",
     )
 
+    glb_texture: Literal["jpeg", "ktx2"] = Field(
+        "jpeg",
+        description="As what glb has its picture. ktx2 (KHR_texture_basisu) takes a quarter of the "
+        "memory of a graphics card, or less, and is shown sooner and with its smaller copies; the "
+        "file is larger. three.js and Babylon read it, with a transcoder to be switched on; other "
+        "programs may not know it.",
+    )
+
     @field_validator("formats")
     @classmethod
     def _each_once(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:

@@ -4,11 +4,11 @@ glTF is right-handed with +Y up, our world has +Z up: positions and normals are 
 (`pipelines.exports.frame`), since some readers ignore node transforms. Only where 32 bits would
 blur them, as in map coordinates, the node's translation has what is common to all. `COLOR_0` is
 linear (glTF 2.0, section 3.7.2.1), our colours are sRGB: they are converted, into 16-bit so that
-dark tones keep their steps. A texture is a JPEG, which is sRGB as base colours are, and lies in the
-file. A capture's colours contain the light, hence KHR_materials_unlit.
+dark tones keep their steps. A texture is a JPEG or a KTX2, both sRGB as base colours are, and lies
+in the file. A capture's colours contain the light, hence KHR_materials_unlit.
 
 Source: Khronos, glTF 2.0 specification; KHR_materials_unlit, KHR_mesh_quantization,
-EXT_meshopt_compression.
+KHR_texture_basisu, EXT_meshopt_compression.
 """
 
 from __future__ import annotations
@@ -18,23 +18,26 @@ import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.exports.formats import meshopt
+from pipelines.exports.formats import ktx2, meshopt
+from pipelines.exports.formats.srgb import linear_from_srgb, srgb_from_linear
 from pipelines.exports.frame import FROM_WORLD, Frame, back_to_world, is_far
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 
 Floats = NDArray[np.float64]
+Texture = Literal["jpeg", "ktx2"]
 
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT32, _UINT16, _INT8 = 5126, 5125, 5123, 5120
 _STEPS = 65535.0
 _QUANTIZATION = "KHR_mesh_quantization"
 _COMPRESSION = "EXT_meshopt_compression"
+_KTX2 = "KHR_texture_basisu"
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
 _JPEG_QUALITY = 92
@@ -48,14 +51,6 @@ _MATERIAL: dict[str, Any] = {
     },
     "extensions": {"KHR_materials_unlit": {}},
 }
-
-
-def linear_from_srgb(color: Floats) -> Floats:
-    """Linear light in [0, 1] from sRGB in [0, 1] (IEC 61966-2-1)."""
-    linear: Floats = np.where(
-        color <= 0.04045, color / 12.92, ((np.maximum(color, 0.0) + 0.055) / 1.055) ** 2.4
-    )
-    return linear
 
 
 @dataclass(frozen=True)
@@ -126,34 +121,33 @@ class _Accessor:
         return plain
 
 
-def srgb_from_linear(linear: Floats) -> Floats:
-    """The inverse of `linear_from_srgb`."""
-    color: Floats = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1 / 2.4) - 0.055
-    )
-    return color
-
-
 @dataclass(frozen=True)
 class GlbStyle:
     """unlit: colours as they are, which hold the light of the capture; else a rough surface that
     the viewer's lamps light. quantized: places in 65535 steps of the longest side and half the
     bytes a vertex (`KHR_mesh_quantization`), for viewers that know it. compressed: so, and what is
     left in half the bytes once more (`EXT_meshopt_compression`), for those that can read that.
+    texture: as what the picture lies in the file, ktx2 for viewers that know `KHR_texture_basisu`.
     """
 
     unlit: bool = True
     quantized: bool = False
     compressed: bool = False
+    texture: Texture = "jpeg"
 
     @property
     def in_steps(self) -> bool:
         """Whether places are whole numbers."""
         return self.quantized or self.compressed
 
-    def extensions(self) -> list[str]:
+    def extensions(self, textured: bool) -> list[str]:
         """What a reader must know to show anything."""
-        return [_QUANTIZATION] * self.in_steps + [_COMPRESSION] * self.compressed
+        of_shape = [_QUANTIZATION] * self.in_steps + [_COMPRESSION] * self.compressed
+        return of_shape + [_KTX2] * (textured and self.texture == "ktx2")
+
+    def picture(self, texture: NDArray[np.uint8]) -> bytes:
+        """The texture [H, W, 3] as the file has it. Raises ValueError for sides that cannot be."""
+        return ktx2.encode(texture) if self.texture == "ktx2" else jpeg(texture)
 
 
 def write_mesh(
@@ -166,7 +160,8 @@ def write_mesh(
 
     frame: where the mesh lies, and whether a unit is a metre, as glTF would have it;
     `asset.extras.frame` says it, and `from_world` beside it how it came there, if it was moved.
-    Raises ValueError for an empty mesh, and where shapes or indices do not fit.
+    Raises ValueError for an empty mesh, where shapes or indices do not fit, and for a texture that
+    the style's kind cannot hold.
     """
     vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
     if len(vertices) == 0 or len(faces) == 0:
@@ -199,7 +194,7 @@ def write_mesh(
         _colored(mesh, style.in_steps),
         _Accessor("", faces.astype("<u4"), "SCALAR", _UINT32),
     ]
-    picture = jpeg(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
+    picture = style.picture(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
     # Arrays are multiples of 4 bytes by their types, or made so; the picture comes last.
     arrays = [
         accessor.compressed() if style.compressed else accessor.values.tobytes()
@@ -245,11 +240,19 @@ def read_mesh(path: Path) -> TriangleMesh | TexturedMesh:
         in_steps = kinds[at["TEXCOORD_0"]] == _UINT16
         flat = np.frombuffer(views[at["TEXCOORD_0"]], "<u2" if in_steps else "<f4")
         uv = flat.reshape(-1, 2).astype(np.float64) / (_STEPS if in_steps else 1.0)
-        with Image.open(io.BytesIO(views[document["images"][0]["bufferView"]])) as opened:
-            texture = np.asarray(opened.convert("RGB"))
+        (image,) = document["images"]
+        texture = _picture(views[image["bufferView"]], image["mimeType"])
     except (KeyError, IndexError, TypeError, OSError, ValueError) as error:
         raise ValueError(f"{path.name} is no mesh of ours: {error}") from error
     return TexturedMesh(position, faces, normal, uv, texture)
+
+
+def _picture(data: memoryview, kind: str) -> NDArray[np.uint8]:
+    """The texture [H, W, 3] of a file. kind: its MIME type."""
+    if kind == "image/ktx2":
+        return ktx2.decode(data)
+    with Image.open(io.BytesIO(data)) as opened:
+        return np.asarray(opened.convert("RGB"))
 
 
 def _content(view: dict[str, Any], binary: memoryview) -> memoryview:
@@ -360,7 +363,7 @@ def _document(
     material = {
         key: value for key, value in _MATERIAL.items() if style.unlit or key != "extensions"
     }
-    required = style.extensions()
+    required = style.extensions(picture_bytes > 0)
     used = ["KHR_materials_unlit"] * style.unlit + required
     # What stands for the arrays as they are unpacked: it is nowhere, and has a length.
     unpacked = {"byteLength": whole, "extensions": {_COMPRESSION: {"fallback": True}}}
@@ -394,8 +397,13 @@ def _document(
         base = {**_MATERIAL["pbrMetallicRoughness"], "baseColorTexture": {"index": 0}}
         material["pbrMetallicRoughness"] = base
         wraps = {"wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}
-        document["images"] = [{"bufferView": len(accessors), "mimeType": "image/jpeg"}]
+        document["images"] = [
+            {"bufferView": len(accessors), "mimeType": f"image/{style.texture}"}
+        ]
         document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR, **wraps}]
-        document["textures"] = [{"sampler": 0, "source": 0}]
+        source: dict[str, Any] = {"source": 0}
+        if style.texture == "ktx2":
+            source = {"extensions": {_KTX2: source}}
+        document["textures"] = [{"sampler": 0, **source}]
     document["materials"] = [material]
     return document

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.exports.formats.archive import entry
-from pipelines.exports.formats.glb import jpeg, linear_from_srgb
+from pipelines.exports.formats.glb import jpeg
+from pipelines.exports.formats.srgb import linear_from_srgb
 from pipelines.exports.frame import Frame, is_far
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 

@@ -12,12 +12,8 @@ import numpy as np
 import open3d
 import pytest
 
-from pipelines.exports.formats.glb import (
-    GlbStyle,
-    linear_from_srgb,
-    read_mesh,
-    write_mesh,
-)
+from pipelines.exports.formats.glb import GlbStyle, read_mesh, write_mesh
+from pipelines.exports.formats.srgb import linear_from_srgb
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from tests.gltf_validator import problems_of, report_of
 

@@ -12,7 +12,7 @@ from PIL import Image
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
 
 from pipelines.exports.formats import usdz
-from pipelines.exports.formats.glb import linear_from_srgb
+from pipelines.exports.formats.srgb import linear_from_srgb
 from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from tests.unit.pipelines.exports.formats import solids
