@@ -48,25 +48,35 @@ _GLB_PAGE = """<!doctype html><script type="importmap">
 </script><script type="module">
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { KTX2Loader } from 'three/addons/loaders/KTX2Loader.js';
 import { MeshoptDecoder } from 'three/addons/libs/meshopt_decoder.module.js';
 const tell = (answer) => fetch('/told', {method: 'POST', body: JSON.stringify(answer)});
 window.addEventListener('unhandledrejection', (event) => tell({error: String(event.reason)}));
 try {
-  const begun = performance.now();
-  const gltf = await new GLTFLoader().setMeshoptDecoder(MeshoptDecoder).loadAsync('/files/FILE');
-  const loaded = performance.now() - begun;
   const side = 320, turns = TURNS;
   const renderer = new THREE.WebGLRenderer({antialias: true, preserveDrawingBuffer: true});
   renderer.setSize(side, side);
+  const textures = new KTX2Loader().setTranscoderPath('/three/examples/jsm/libs/basis/');
+  const loader = new GLTFLoader().setMeshoptDecoder(MeshoptDecoder);
+  loader.setKTX2Loader(textures.detectSupport(renderer));
+  const begun = performance.now();
+  const gltf = await loader.loadAsync('/files/FILE');
+  const loaded = performance.now() - begun;
   const scene = new THREE.Scene();
   scene.background = new THREE.Color(0x202020);
   scene.add(gltf.scene, new THREE.HemisphereLight(0xffffff, 0x888888, 3));
-  let triangles = 0, points = [];
+  let triangles = 0, points = [], texture = null;
   const corner = new THREE.Vector3();
   gltf.scene.updateMatrixWorld(true);
   gltf.scene.traverse((part) => {
     if (!part.isMesh) return;
     triangles += part.geometry.index.count / 3;
+    const map = part.material.map;
+    if (map) {
+      const bytes = map.mipmaps.reduce((total, level) => total + level.data.byteLength, 0);
+      texture = {compressed: Boolean(map.isCompressedTexture), format: map.format,
+        width: map.image.width, levels: map.mipmaps.length, bytes, srgb: map.colorSpace};
+    }
     const place = part.geometry.attributes.position;
     for (let i = 0; i < place.count; i += Math.max(1, Math.floor(place.count / 5000))) {
       points.push(corner.fromBufferAttribute(place, i).applyMatrix4(part.matrixWorld).toArray());
@@ -90,7 +100,7 @@ try {
     renderer.render(scene, camera);
     sheet.getContext('2d').drawImage(renderer.domElement, side * turn, 0);
   }
-  await tell({picture: sheet.toDataURL('image/png'), triangles, load_ms: Math.round(loaded),
+  await tell({picture: sheet.toDataURL('image/png'), triangles, texture, load_ms: Math.round(loaded),
     frame_ms: Math.round((performance.now() - drawn) / turns)});
 } catch (error) { tell({error: String(error)}); }
 </script>"""

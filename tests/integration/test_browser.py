@@ -41,8 +41,14 @@ def _square(textured: bool) -> TriangleMesh | TexturedMesh:
 @pytest.mark.parametrize("textured", [False, True], ids=["vertex-colours", "texture"])
 @pytest.mark.parametrize(
     "style",
-    [GlbStyle(), GlbStyle(quantized=True), GlbStyle(compressed=True)],
-    ids=["plain", "quantized", "compressed"],
+    [
+        GlbStyle(),
+        GlbStyle(quantized=True),
+        GlbStyle(compressed=True),
+        GlbStyle(texture="ktx2"),
+        GlbStyle(compressed=True, texture="ktx2"),
+    ],
+    ids=["plain", "quantized", "compressed", "ktx2", "compressed-ktx2"],
 )
 def test_three_js_shows_a_mesh_upright_in_its_colours(
     tmp_path: Path, textured: bool, style: GlbStyle
@@ -56,6 +62,9 @@ def test_three_js_shows_a_mesh_upright_in_its_colours(
     shown = show(path, tmp_path, turns=1)
     assert shown.problem == ""
     assert shown.facts["triangles"] == 2
+    if textured:
+        assert shown.facts["texture"]["compressed"] == (style.texture == "ktx2")
+        assert shown.facts["texture"]["levels"] == (7 if style.texture == "ktx2" else 0)
     assert shown.picture is not None
     with Image.open(shown.picture) as opened:
         picture = np.asarray(opened.convert("RGB")).astype(int)

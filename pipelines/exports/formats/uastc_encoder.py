@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +26,6 @@ Floats = NDArray[np.float32]
 
 _PORTION = 4096
 """Blocks that are worked on at once: they fit in a processor's cache."""
-_THREADS = 2
 _GOOD = 48 * 0.5
 """Squared error of a block, summed over channels, that one line is good enough for."""
 _ROUNDS, _AXIS_ROUNDS = 3, 6
@@ -42,9 +40,7 @@ def encode(picture: Bytes) -> Bytes:
     rows, columns = filled.shape[0] // 4, filled.shape[1] // 4
     pixels = filled.reshape(rows, 4, columns, 4, 3).swapaxes(1, 2).reshape(-1, 16, 3)
     parts = [pixels[first : first + _PORTION] for first in range(0, len(pixels), _PORTION)]
-    # numpy lets go of the interpreter's lock.
-    with ThreadPoolExecutor(_THREADS) as pool:
-        return np.concatenate(list(pool.map(encode_blocks, parts)))
+    return np.concatenate([encode_blocks(part) for part in parts])
 
 
 def encode_blocks(pixels: Bytes) -> Bytes:
