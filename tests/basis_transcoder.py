@@ -1,4 +1,4 @@
-"""What three.js makes of a KTX2 file: Basis Universal's own transcoder, as three.js brings it, in Node.
+"""What three.js makes of a KTX2 file: Basis Universal's transcoder, as three.js brings it, in Node.
 
 Nothing of it is ours: `tests.benchmarks.browser.three_folder` fetches it from npm.
 """

@@ -100,8 +100,8 @@ try {
     renderer.render(scene, camera);
     sheet.getContext('2d').drawImage(renderer.domElement, side * turn, 0);
   }
-  await tell({picture: sheet.toDataURL('image/png'), triangles, texture, load_ms: Math.round(loaded),
-    frame_ms: Math.round((performance.now() - drawn) / turns)});
+  await tell({picture: sheet.toDataURL('image/png'), triangles, texture,
+    load_ms: Math.round(loaded), frame_ms: Math.round((performance.now() - drawn) / turns)});
 } catch (error) { tell({error: String(error)}); }
 </script>"""
 _VIDEO_PAGE = """<!doctype html><video muted playsinline></video><script>

@@ -1,9 +1,9 @@
 """Hints of a UASTC block for whoever makes ETC1 of it: how to halve it and how much light varies.
 
 An ETC1 block is two halves, side by side or one above the other (flip), each a colour and, for each
-pixel, one of four steps along grey (its table's). Colours are in 32 steps of which the second is
-told by its difference to the first (diff), or in 16 each. The reader takes the mean of the pixels
-and lets a bias move it; without one it would leave no black and no white, hence the one chosen here.
+pixel, one of four steps along grey (its table's). Colours are in 32 steps, the second told by its
+difference to the first (diff), or in 16 each. The reader takes the mean of a half's pixels and
+moves it by a bias. None would leave no black and no white: the one here keeps both.
 
 Symbols: B blocks, last in arrays, as that is how they are fast.
 
@@ -95,7 +95,7 @@ def solid_hints(colors: Bytes) -> Bytes:
 
 @functools.cache
 def _solid_choices() -> tuple[Bytes, Ints]:
-    """For each table and step [32] and each value [256] the nearest of 32, and its squared error."""
+    """For each table and step [32] and value [256] the nearest of 32, and its squared error."""
     steps = np.array([(-large, -small, small, large) for small, large in _TABLES]).ravel()
     of_32 = np.arange(32)
     shown = np.clip(((of_32 << 3) | (of_32 >> 2)) + steps[:, None], 0, 255)

@@ -397,9 +397,7 @@ def _document(
         base = {**_MATERIAL["pbrMetallicRoughness"], "baseColorTexture": {"index": 0}}
         material["pbrMetallicRoughness"] = base
         wraps = {"wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}
-        document["images"] = [
-            {"bufferView": len(accessors), "mimeType": f"image/{style.texture}"}
-        ]
+        document["images"] = [{"bufferView": len(accessors), "mimeType": f"image/{style.texture}"}]
         document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR, **wraps}]
         source: dict[str, Any] = {"source": 0}
         if style.texture == "ktx2":

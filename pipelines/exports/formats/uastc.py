@@ -78,7 +78,9 @@ class Mode:
             repeated = sum(low << (self.low_bits * place) for place in range(times))
             return np.asarray(repeated >> (self.low_bits * times - 8))
         factor, source = _SPREAD[self.base << self.low_bits]
-        added = sum(((low >> int(bit)) & 1) << (8 - at) for at, bit in enumerate(source) if bit > "0")
+        added = sum(
+            ((low >> int(bit)) & 1) << (8 - at) for at, bit in enumerate(source) if bit > "0"
+        )
         flip = (low & 1) * 0x1FF
         value = (upper * factor + added) ^ flip
         return np.asarray((flip & 0x80) | (value >> 2)).ravel()
@@ -109,10 +111,10 @@ SOLID_CODE, _SOLID_CODE_BITS = 0x17, 5
 
 @dataclass(frozen=True)
 class Blocks:
-    """N blocks of a mode. ends: [N, 6 S], of a subset red of both ends, green, blue, each a place in
-    `Mode.ends`. weights: [N, 16 P], of a pixel those of all planes, each a place in `Mode.weights`.
-    pattern: [N], a row of PATTERNS, where there are two subsets. channel: [N], that of the second
-    plane, where there is one."""
+    """N blocks of a mode. ends: [N, 6 S], of a subset red of both ends, then green, then blue, each
+    a place in `Mode.ends`. weights: [N, 16 P], of a pixel those of all planes, each a place in
+    `Mode.weights`. pattern: [N], a row of PATTERNS, where there are two subsets. channel: [N], that
+    of the second plane, where there is one."""
 
     mode: Mode
     ends: Bytes
@@ -123,25 +125,24 @@ class Blocks:
     def colors(self) -> Bytes:
         """What the pixels [N, 16, 3] are."""
         mode, many = self.mode, len(self.ends)
-        lines = (257 * mode.ends[self.ends]).reshape(many, mode.subsets, 3, 2)
+        # 16 bits for 8, whose middle is what the pixel is.
+        lines: Ints = (mode.ends * 257)[self.ends].reshape(many, mode.subsets, 3, 2)
         if mode.subsets == 2:
             subset = PATTERNS[self.pattern][:, :, None, None]
-            at_pixels = np.where(subset == 1, lines[:, None, 1], lines[:, None, 0])
+            at_pixels: Ints = np.where(subset == 1, lines[:, None, 1], lines[:, None, 0])
         else:
             at_pixels = lines[:, :1]
         weights = mode.weights[self.weights].reshape(many, 16, mode.planes)
-        by_channel = np.broadcast_to(weights[:, :, :1], (many, 16, 3))
+        by_channel: Ints = np.broadcast_to(weights[:, :, :1], (many, 16, 3))
         if mode.planes == 2:
             second = np.arange(3) == self.channel[:, None, None]
             by_channel = np.where(second, weights[:, :, 1:], by_channel)
         begin, end = at_pixels[..., 0], at_pixels[..., 1]
-        mixed = (begin * (64 - by_channel) + end * by_channel + 32) >> 14
-        return mixed.astype(np.uint8)
+        mixed: Ints = begin * (64 - by_channel) + end * by_channel + 32
+        return (mixed >> 14).astype(np.uint8)
 
 
-_FIRST = np.stack(
-    [np.isin(np.arange(16), [np.argmin(row), np.argmax(row)]) for row in PATTERNS]
-)
+_FIRST = np.stack([np.isin(np.arange(16), [np.argmin(row), np.argmax(row)]) for row in PATTERNS])
 """Which pixels are the first of their subset, [30, 16]."""
 
 
@@ -243,7 +244,8 @@ def _told(mode: Mode, pattern: Bytes) -> NDArray[np.bool_]:
     if mode.subsets == 2:
         first |= _FIRST[pattern]
     highest = np.arange(mode.weight_bits) == mode.weight_bits - 1
-    return ~(first[:, :, None] & highest).reshape(len(pattern), -1)
+    told: NDArray[np.bool_] = ~(first[:, :, None] & highest).reshape(len(pattern), -1)
+    return told
 
 
 def _bits(values: NDArray[np.integer], size: int) -> Bytes:

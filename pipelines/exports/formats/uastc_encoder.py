@@ -285,4 +285,5 @@ def _pattern(pixels: Floats) -> Ints:
         for at, (a, b) in enumerate(pairs, start=3):
             scatter[a, b] = scatter[b, a] = sums[:, at] - sums[:, a] * mean[:, b]
         left += np.einsum("aa...->...", scatter) - _axis(scatter)[1]
-    return left.argmin(axis=0)
+    best: Ints = left.argmin(axis=0)
+    return best
