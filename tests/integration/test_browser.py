@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.exports.formats.glb import GlbStyle, write_mesh
+from pipelines.exports.formats.glb import GlbStyle, Texture, write_mesh
 from pipelines.exports.formats.mp4 import VideoWriter
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from tests.benchmarks.browser import NoBrowserError, find_browser, show, three_folder
+from tests.texture_pictures import photo, psnr
 
 RED, GREEN = np.array([220, 40, 30]), np.array([30, 180, 60])
 
@@ -76,6 +78,36 @@ def test_three_js_shows_a_mesh_upright_in_its_colours(
         # The colours go over into each other, by light and not by sRGB.
         assert below[0] > 1.5 * below[1]
         assert above[1] > above[0]
+
+
+@pytest.mark.slow
+def test_three_js_shows_a_ktx2_texture_as_it_does_a_jpeg(tmp_path: Path) -> None:
+    try:
+        three_folder()
+    except NoBrowserError as error:
+        pytest.skip(str(error))
+    square = _square(textured=True)
+    assert isinstance(square, TexturedMesh)
+    pictures = []
+    textures: tuple[Texture, ...] = ("jpeg", "ktx2")
+    for texture in textures:
+        path = tmp_path / f"{texture}.glb"
+        mesh = dataclasses.replace(square, texture=photo(256))
+        write_mesh(path, mesh, style=GlbStyle(texture=texture))
+        shown = show(path, tmp_path, turns=1)
+        assert shown.problem == ""
+        if texture == "ktx2":
+            # As ASTC, BC7 and the like, a byte a pixel, with all smaller copies.
+            assert shown.facts["texture"]["compressed"]
+            assert shown.facts["texture"]["bytes"] == 16 * sum(
+                max(1, 64 >> level) ** 2 for level in range(9)
+            )
+            assert shown.facts["texture"]["srgb"] == "srgb"
+        assert shown.picture is not None
+        with Image.open(shown.picture) as opened:
+            pictures.append(np.asarray(opened.convert("RGB")))
+    assert pictures[0].std() > 20.0, "there is something to compare"
+    assert psnr(pictures[1], pictures[0]) > 36.0
 
 
 @pytest.mark.slow

@@ -12,10 +12,12 @@ import numpy as np
 import open3d
 import pytest
 
+from pipelines.exports.formats import ktx2
 from pipelines.exports.formats.glb import GlbStyle, read_mesh, write_mesh
 from pipelines.exports.formats.srgb import linear_from_srgb
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from tests.gltf_validator import problems_of, report_of
+from tests.texture_pictures import psnr
 
 VERTICES = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -270,3 +272,69 @@ def test_a_lit_file_leaves_light_to_the_viewer(
     assert problems_of(path) == []
     assert b"KHR_materials_unlit" not in path.read_bytes()
     assert b"roughnessFactor" in path.read_bytes()
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_texture_may_be_a_ktx2(textured: Path, compressed: bool, tmp_path: Path) -> None:
+    plain = read_mesh(textured)
+    assert isinstance(plain, TexturedMesh)
+    path = tmp_path / "ktx2.glb"
+    write_mesh(path, plain, style=GlbStyle(compressed=compressed, texture="ktx2"))
+    found = read_mesh(path)
+    assert isinstance(found, TexturedMesh)
+    assert psnr(found.texture, plain.texture) > 45.0
+    np.testing.assert_allclose(found.vertices, plain.vertices, atol=1e-4)
+    data = path.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    shape = ["KHR_mesh_quantization", "EXT_meshopt_compression"] * compressed
+    assert document["extensionsRequired"] == [*shape, "KHR_texture_basisu"]
+    assert document["extensionsUsed"] == ["KHR_materials_unlit", *shape, "KHR_texture_basisu"]
+    assert document["textures"] == [
+        {"sampler": 0, "extensions": {"KHR_texture_basisu": {"source": 0}}}
+    ]
+    (image,) = document["images"]
+    assert image["mimeType"] == "image/ktx2"
+    view = document["bufferViews"][image["bufferView"]]
+    begin = 28 + length + view["byteOffset"]
+    np.testing.assert_array_equal(
+        ktx2.decode(data[begin : begin + view["byteLength"]]), found.texture
+    )
+
+
+def test_the_khronos_validator_knows_no_ktx2_and_finds_nothing_else(
+    textured: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "ktx2.glb"
+    write_mesh(path, read_mesh(textured), style=GlbStyle(texture="ktx2"))
+    told = {
+        (message["code"], message.get("pointer"), message["severity"])
+        for message in report_of(path)["issues"]["messages"]
+    }
+    # 1 for a warning, 2 for a note: without the extension, only JPEG and PNG may be.
+    assert told == {
+        ("UNSUPPORTED_EXTENSION", "/extensionsUsed/1", 2),
+        ("VALUE_NOT_IN_LIST", "/images/0/mimeType", 1),
+        ("IMAGE_UNRECOGNIZED_FORMAT", "/images/0", 1),
+        ("UNUSED_OBJECT", "/images/0", 2),
+    }
+
+
+def test_a_ktx2_texture_is_left_out_where_there_is_none_and_refused_where_it_cannot_be(
+    file: Path, textured: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "ktx2.glb"
+    style = GlbStyle(texture="ktx2")
+    write_mesh(path, read_mesh(file), style=style)
+    assert b"KHR_texture_basisu" not in path.read_bytes()
+    assert problems_of(path) == []
+    plain, odd = read_mesh(textured), tmp_path / "odd.glb"
+    assert isinstance(plain, TexturedMesh)
+    with pytest.raises(ValueError, match="62x64 pixels cannot be: sides are multiples of 4"):
+        write_mesh(odd, dataclasses.replace(plain, texture=plain.texture[:, :62]), style=style)
+    assert not odd.exists()
+    write_mesh(path, plain, style=style)
+    broken = path.read_bytes()
+    odd.write_bytes(broken.replace(b"KTX 20", b"KTX 21"))
+    with pytest.raises(ValueError, match=r"odd\.glb is no mesh of ours: no KTX2 texture"):
+        read_mesh(odd)
