@@ -14,7 +14,7 @@ from pipelines.errors import ExportError
 from pipelines.exports.formats import glb
 from pipelines.exports.formats.ply import read_ply, write_mesh, write_points
 from pipelines.exports.frame import FrameName
-from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.placement import placement_of
 from pipelines.nerf.data.light import exposed
 from pipelines.nerf.stereo.maps import DepthMap
@@ -25,6 +25,7 @@ from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.sensor_depth import save_sensor_depth
 from pipelines.workspace import MANIFEST, Workspace
+from tests.texture_pictures import photo
 from tests.unit.pipelines.exports.test_placement import MOVED
 from tests.unit.pipelines.stages import tiny_job
 
@@ -166,6 +167,20 @@ def test_assets_of_another_frame_are_brought_back(job: Workspace, name: FrameNam
     there = tiny_job.run(job, "assess", long_side_px=64)["summary"]
     assert there["mesh"] == pytest.approx(here["mesh"], rel=1e-2)
     assert there["cloud"] == pytest.approx(here["cloud"], rel=1e-2)
+
+
+def test_a_ktx2_texture_is_judged_as_a_jpeg_is(job: Workspace) -> None:
+    _exact_assets(job)
+    path = job.stage("mesh") / "mesh.glb"
+    bare = glb.read_mesh(path)
+    low, size = bare.vertices.min(axis=0), np.ptp(bare.vertices, axis=0)
+    uv = ((bare.vertices - low) / size)[:, :2]
+    mesh = TexturedMesh(bare.vertices, bare.faces, bare.normals, uv, photo(256))
+    scores = []
+    for style in (glb.GlbStyle(), glb.GlbStyle(texture="ktx2")):
+        glb.write_mesh(path, mesh, style=style)
+        scores.append(tiny_job.run(job, "assess", long_side_px=64)["summary"]["mesh"])
+    assert scores[1] == pytest.approx(scores[0], rel=1e-2)
 
 
 def test_the_photos_are_the_held_out_ones(job: Workspace) -> None:

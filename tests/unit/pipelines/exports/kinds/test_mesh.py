@@ -336,6 +336,21 @@ def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -
     assert not (job.stage("mesh") / "mesh-lod3.glb").exists()
 
 
+def test_every_glb_can_have_its_picture_as_a_ktx2(job: Workspace) -> None:
+    wanted = {"glb_texture": "ktx2", "glb_compressed": True, "lods": 1, "texture_px": 1024}
+    summary = tiny_job.run(job, "mesh", **wanted)["summary"]
+    for name in ("mesh.glb", "mesh-lod1.glb", "subject.glb"):
+        data = (job.stage("mesh") / name).read_bytes()
+        assert b'"extensionsRequired":["KHR_mesh_quantization","EXT_meshopt_compression",' in data
+        assert b'"KHR_texture_basisu"]' in data
+        assert b"image/jpeg" not in data
+        found = read_mesh(job.stage("mesh") / name)
+        assert isinstance(found, TexturedMesh)
+        if name == "mesh.glb":
+            assert len(found.texture) == summary["texture_px"]
+            assert found.texture.std() > 5.0
+
+
 def test_a_mesh_for_which_memory_has_no_room_is_coarser_and_says_so(
     job: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
