@@ -32,7 +32,7 @@ _HEADER, _INDEX, _LEVEL = struct.Struct("<9I"), struct.Struct("<4I2Q"), struct.S
 _UNDEFINED, _ZSTANDARD = 0, 2
 _UASTC, _BT709, _SRGB, _RGB = 166, 1, 2, 0
 _ZSTANDARD_LEVEL = 9
-"""Higher ones make 1 % less of blocks and take many times as long."""
+"""The highest makes 4 % less of blocks in sixteen times as long."""
 _MAX_SIDE = 16384
 _WRITER = b"KTXwriter\0nerfworks\0"
 _DESCRIPTOR = struct.pack(
@@ -108,21 +108,21 @@ def decode(data: bytes | memoryview, level: int = 0) -> Bytes:
 
 def levels(picture: Bytes) -> list[Bytes]:
     """The picture [H, W, 3] and its smaller copies, down to one pixel, by means of linear light."""
-    linear = _LINEAR[picture]
-    found = [picture]
-    height, width = picture.shape[:2]
-    while max(height, width) > 1:
-        height, width = max(1, height // 2), max(1, width // 2)
-        linear = _smaller(linear, height, width)
-        found.append(_srgb(linear))
+    # Channel by channel: light is four times the picture's bytes.
+    channels = [_smaller(picture[:, :, channel]) for channel in range(3)]
+    return [picture, *(np.stack(level, axis=2) for level in zip(*channels, strict=True))]
+
+
+def _smaller(channel: Bytes) -> list[Bytes]:
+    """Its copies, each with half the sides. Boxes overlap where a side is odd."""
+    light = Image.fromarray(_LINEAR[channel])
+    found = []
+    while max(light.size) > 1:
+        width, height = light.size
+        half = (max(1, width // 2), max(1, height // 2))
+        light = light.resize(half, Image.Resampling.BOX)
+        found.append(_srgb(np.asarray(light)))
     return found
-
-
-def _smaller(linear: Floats, height: int, width: int) -> Floats:
-    """Means over boxes, which overlap where a side is odd."""
-    size, box = (width, height), Image.Resampling.BOX
-    planes = [Image.fromarray(linear[:, :, at]).resize(size, box) for at in range(3)]
-    return np.stack([np.asarray(plane) for plane in planes], axis=2)
 
 
 def _srgb(linear: Floats) -> Bytes:
