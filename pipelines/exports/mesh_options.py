@@ -144,9 +144,9 @@ class MeshOptions(CropOptions, TextureOptions):
     glb_texture: Literal["jpeg", "ktx2"] = Field(
         "jpeg",
         description="As what glb has its picture. ktx2 (KHR_texture_basisu) takes a quarter of the "
-        "memory of a graphics card, or less, and is shown sooner and with its smaller copies; the "
-        "file is larger. three.js and Babylon read it, with a transcoder to be switched on; other "
-        "programs may not know it.",
+        "graphics card's memory, or less, and brings its smaller copies along; the file is larger. "
+        "three.js and Babylon read it, with a transcoder to be switched on; other programs may not "
+        "know it.",
     )
 
     @field_validator("formats")
