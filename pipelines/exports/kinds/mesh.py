@@ -68,7 +68,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=17,
+    version=18,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

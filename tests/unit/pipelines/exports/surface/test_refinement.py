@@ -141,3 +141,18 @@ def test_progress_rises_and_may_stop_it() -> None:
     assert told == sorted(told)
     assert told[-1] == pytest.approx(1.0)
     assert len(told) > 10
+
+
+def test_photos_that_would_carry_a_surface_far_away_are_not_believed() -> None:
+    """Every picture is shifted as if the wall were three edges nearer."""
+    right = views()
+    wrong = []
+    for view in right:
+        away = (view.center - ORIGIN)[:2] / WALL
+        fx, fy, cx, cy = view.lens
+        near = WALL / (WALL - 3.0 * STEP) - 1.0
+        shift = (cx + fx * away[0] * near, cy + fy * away[1] * near)
+        wrong.append(replace(view, lens=(fx, fy, *shift)))
+    moved = refined(sheet(0.0), wrong, flat=False)
+    # Believed, they carry it away by 2.9 edges.
+    assert abs(np.median(height(moved.vertices))) < STEP
