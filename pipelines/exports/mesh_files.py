@@ -5,6 +5,7 @@ Shapes come from `pipelines.exports.mesh_shape`, in the world of cameras.json.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from pipelines.exports.judged import JUDGED_MESH
 from pipelines.exports.levels import levels_of, texture_px_of
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.mesh_options import Format, MeshOptions
-from pipelines.exports.mesh_shape import REDUCE_SHARE, Part
+from pipelines.exports.mesh_shape import REDUCE_SHARE, Part, told_part
 from pipelines.exports.placement import Placement
 from pipelines.exports.subject import Thing
 from pipelines.exports.subject_files import save_subject
@@ -36,6 +37,8 @@ _FILES: dict[Format, str] = {
 _TEXTURED = frozenset({"glb", "obj", "usdz"})
 """Formats that carry a texture."""
 _TEXTURE_SHARE, _SUBJECT_SHARE = 0.96, 0.98
+_PAINTED = 0.9
+"""Of a coarser level, when only its file is left."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +65,17 @@ class Painter:
                 update={"texture_px": texture_px_of(level, self.options.texture_px)}
             ),
             self.ctx,
-            (self._share(level + 0.1), self._share(level + 1)),
+            (self._share(level + 0.1), self._share(level + (_PAINTED if level else 1.0))),
             self.scene,
         )
 
     def tell_reducing(self, level: int, done: float) -> None:
         """Say that the shape of a level is being made; may raise."""
         self.ctx.progress(self._share(level + 0.1 * done), "reducing for a coarser level")
+
+    def tell_writing(self, level: int, done: float) -> None:
+        """Say that the file of a level is being written; may raise."""
+        self.ctx.progress(self._share(level + _PAINTED + (1.0 - _PAINTED) * done), "writing")
 
     def _share(self, levels: float) -> float:
         """Of the export's progress, when so many levels are painted."""
@@ -81,7 +88,13 @@ def write_levels(mesh: TriangleMesh, paint: Painter, place: Placement) -> list[d
     shapes = levels_of(mesh, options.lods, lambda done: paint.tell_reducing(len(told) + 1, done))
     for level, shape in enumerate(shapes, start=1):
         coarse, path = paint(shape, level), paint.ctx.out / f"mesh-lod{level}.glb"
-        glb.write_mesh(path, place.mesh(coarse), place.frame(options.up_axis), _style(options))
+        glb.write_mesh(
+            path,
+            place.mesh(coarse),
+            place.frame(options.up_axis),
+            _style(options),
+            functools.partial(paint.tell_writing, level),
+        )
         told.append({"file": path.name, **skin_told(coarse)})
     return told
 
@@ -94,11 +107,12 @@ def write_mesh(
     ctx: StageContext,
 ) -> None:
     """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
-    ctx.progress(_TEXTURE_SHARE, "writing")
+    told = told_part(ctx, "writing", _TEXTURE_SHARE, _SUBJECT_SHARE)
+    told(0.0)
     frame = place.frame(options.up_axis)
     mesh, skin = place.mesh(mesh), place.mesh(skin)
     writers: dict[Format, Callable[[Path], None]] = {
-        "glb": lambda path: glb.write_mesh(path, skin, frame, _style(options)),
+        "glb": lambda path: glb.write_mesh(path, skin, frame, _style(options), told),
         "ply": lambda path: ply.write_mesh(path, mesh, frame),
         "obj": lambda path: obj.write_mesh(path, skin, frame),
         "stl": lambda path: stl.write_mesh(path, mesh, frame),
@@ -120,7 +134,8 @@ def write_subject(
     ctx: StageContext,
 ) -> dict[str, Any]:
     """Write the thing that was walked round beside the mesh; what is told of it."""
-    ctx.progress(_SUBJECT_SHARE, "cutting out the subject")
+    told = told_part(ctx, "cutting out the subject", _SUBJECT_SHARE, 1.0)
+    told(0.0)
     shown = scene.training_images()
     return save_subject(
         ctx.out,
@@ -130,7 +145,7 @@ def write_subject(
         gaze_of(shown, [scene.lens_of(image) for image in shown]),
         scene.cameras.metric,
         _style(options),
-        ctx.check_cancelled,
+        told,
     )
 
 

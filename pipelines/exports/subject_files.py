@@ -23,6 +23,7 @@ from pipelines.exports.subject_picture import save_subject_picture
 from pipelines.scene.gaze import Gaze
 
 SUBJECT, PICTURE = "subject.glb", "subject.jpg"
+_CUT_SHARE, _WRITTEN_SHARE = 0.2, 0.8
 _WORLD = "the world of cameras.json moved: the origin is under the subject"
 
 
@@ -34,22 +35,29 @@ def save_subject(
     gaze: Gaze,
     metric: bool,
     style: GlbStyle,
-    check: Callable[[], None],
+    on_progress: Callable[[float], None],
 ) -> dict[str, Any]:
     """Write `subject.glb` and `subject.jpg`; what is told of them: nothing, if nothing is left.
 
     whole, skin: the delivered mesh of the world with its vertices' colours, and as it is painted.
-    check: called between steps; may raise.
+    on_progress: told the share that is done between steps; may raise.
     """
     cut = cut_out(skin, thing)
     if len(cut.faces) == 0:
         return {}
-    check()
+    on_progress(_CUT_SHARE)
     rows = np.column_stack([np.eye(3), -thing.origin])
     frame = Frame("z", metric, _WORLD, tuple(tuple(map(float, row)) for row in rows))
-    glb.write_mesh(folder / SUBJECT, shifted(cut, -thing.origin), frame, style)
-    check()
-    save_subject_picture(folder / PICTURE, whole, cut, thing.region, gaze.poses[:, :, 3], check)
+
+    def on_texture(done: float) -> None:
+        on_progress(_CUT_SHARE + (_WRITTEN_SHARE - _CUT_SHARE) * done)
+
+    glb.write_mesh(folder / SUBJECT, shifted(cut, -thing.origin), frame, style, on_texture)
+    on_progress(_WRITTEN_SHARE)
+    eyes = gaze.poses[:, :, 3]
+    save_subject_picture(
+        folder / PICTURE, whole, cut, thing.region, eyes, lambda: on_progress(_WRITTEN_SHARE)
+    )
     return {
         "file": SUBJECT,
         "num_faces": len(cut.faces),

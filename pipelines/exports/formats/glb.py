@@ -16,6 +16,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -145,9 +146,12 @@ class GlbStyle:
         of_shape = [_QUANTIZATION] * self.in_steps + [_COMPRESSION] * self.compressed
         return of_shape + [_KTX2] * (textured and self.texture == "ktx2")
 
-    def picture(self, texture: NDArray[np.uint8]) -> bytes:
-        """The texture [H, W, 3] as the file has it. Raises ValueError for sides that cannot be."""
-        return ktx2.encode(texture) if self.texture == "ktx2" else jpeg(texture)
+    def picture(self, texture: NDArray[np.uint8], on_progress: Callable[[float], None]) -> bytes:
+        """The texture [H, W, 3] as the file has it. Raises ValueError for sides that cannot be.
+
+        on_progress: as of `write_mesh`.
+        """
+        return ktx2.encode(texture, on_progress) if self.texture == "ktx2" else jpeg(texture)
 
 
 def write_mesh(
@@ -155,11 +159,14 @@ def write_mesh(
     mesh: TriangleMesh | TexturedMesh,
     frame: Frame = Frame(),
     style: GlbStyle = GlbStyle(),
+    on_progress: Callable[[float], None] = lambda done: None,
 ) -> None:
     """Write a mesh of our world, +Z up; its normals may have any length.
 
     frame: where the mesh lies, and whether a unit is a metre, as glTF would have it;
     `asset.extras.frame` says it, and `from_world` beside it how it came there, if it was moved.
+    on_progress: told the share of a KTX2 that is done, which takes seconds; may raise, and then
+    there is no file.
     Raises ValueError for an empty mesh, where shapes or indices do not fit, and for a texture that
     the style's kind cannot hold.
     """
@@ -194,7 +201,9 @@ def write_mesh(
         _colored(mesh, style.in_steps),
         _Accessor("", faces.astype("<u4"), "SCALAR", _UINT32),
     ]
-    picture = style.picture(mesh.texture) if isinstance(mesh, TexturedMesh) else b""
+    picture = b""
+    if isinstance(mesh, TexturedMesh):
+        picture = style.picture(mesh.texture, on_progress)
     # Arrays are multiples of 4 bytes by their types, or made so; the picture comes last.
     arrays = [
         accessor.compressed() if style.compressed else accessor.values.tobytes()

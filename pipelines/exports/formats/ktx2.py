@@ -15,6 +15,7 @@ KHR_texture_basisu.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 import numpy as np
 import zstandard
@@ -34,6 +35,7 @@ _UASTC, _BT709, _SRGB, _RGB = 166, 1, 2, 0
 _ZSTANDARD_LEVEL = 9
 """The highest makes 4 % less of blocks in sixteen times as long."""
 _MAX_SIDE = 16384
+_ENCODE_SHARE = 0.95
 _WRITER = b"KTXwriter\0nerfworks\0"
 _DESCRIPTOR = struct.pack(
     "<I IHH 4B 4B 8B HBB 4B 2I",
@@ -49,8 +51,11 @@ _BETWEEN = linear_from_srgb(np.linspace(0.5, 254.5, 255) / 255.0).astype(np.floa
 """Where one 8-bit value ends and the next begins, in linear light."""
 
 
-def encode(picture: Bytes) -> bytes:
-    """RGB [H, W, 3], sRGB, with all its levels. Raises ValueError for sides that are not right."""
+def encode(picture: Bytes, on_progress: Callable[[float], None] = lambda done: None) -> bytes:
+    """RGB [H, W, 3], sRGB, with all its levels. Raises ValueError for sides that are not right.
+
+    on_progress: told the share that is done; may raise.
+    """
     height, width = picture.shape[:2]
     if picture.dtype != np.uint8 or picture.shape[2:] != (3,):
         raise ValueError(f"a KTX2 texture is RGB of 8 bits, not {picture.shape} {picture.dtype}")
@@ -59,7 +64,7 @@ def encode(picture: Bytes) -> bytes:
             f"a KTX2 texture of {width}x{height} pixels cannot be: sides are multiples of 4, "
             f"at most {_MAX_SIDE}"
         )
-    blocks = [uastc_encoder.encode(level).tobytes() for level in levels(picture)]
+    blocks = _encoded(levels(picture), lambda done: on_progress(_ENCODE_SHARE * done))
     compressor = zstandard.ZstdCompressor(level=_ZSTANDARD_LEVEL, write_content_size=True)
     packed = [compressor.compress(level) for level in blocks]
     described = len(MAGIC) + _HEADER.size + _INDEX.size + _LEVEL.size * len(blocks)
@@ -73,6 +78,7 @@ def encode(picture: Bytes) -> bytes:
         at += len(small)
     head = _HEADER.pack(_UNDEFINED, 1, width, height, 0, 0, 1, len(blocks), _ZSTANDARD)
     head += _INDEX.pack(described, len(_DESCRIPTOR), noted, len(note), 0, 0)
+    on_progress(1.0)
     return b"".join([MAGIC, head, *reversed(index), _DESCRIPTOR, note, *reversed(packed)])
 
 
@@ -111,6 +117,20 @@ def levels(picture: Bytes) -> list[Bytes]:
     # Channel by channel: light is four times the picture's bytes.
     channels = [_smaller(picture[:, :, channel]) for channel in range(3)]
     return [picture, *(np.stack(level, axis=2) for level in zip(*channels, strict=True))]
+
+
+def _encoded(pictures: list[Bytes], on_progress: Callable[[float], None]) -> list[bytes]:
+    """The blocks of each of them."""
+    total, before = sum(picture.size for picture in pictures), 0
+    found = []
+    for picture in pictures:
+
+        def on_share(done: float, before: int = before, size: int = picture.size) -> None:
+            on_progress((before + size * done) / total)
+
+        found.append(uastc_encoder.encode(picture, on_share).tobytes())
+        before += picture.size
+    return found
 
 
 def _smaller(channel: Bytes) -> list[Bytes]:

@@ -32,15 +32,21 @@ _ROUNDS, _AXIS_ROUNDS = 3, 6
 _TINY = np.float32(1e-6)
 
 
-def encode(picture: Bytes) -> Bytes:
+def encode(picture: Bytes, on_progress: Callable[[float], None] = lambda done: None) -> Bytes:
     """RGB [H, W, 3] as blocks [ceil(H/4) ceil(W/4), 16], row by row. Where the sides are no
-    multiples of 4 the last pixels are repeated."""
+    multiples of 4 the last pixels are repeated.
+
+    on_progress: told the share that is done after each portion; may raise.
+    """
     height, width = picture.shape[:2]
     filled = np.pad(picture, ((0, -height % 4), (0, -width % 4), (0, 0)), "edge")
     rows, columns = filled.shape[0] // 4, filled.shape[1] // 4
     pixels = filled.reshape(rows, 4, columns, 4, 3).swapaxes(1, 2).reshape(-1, 16, 3)
-    parts = [pixels[first : first + _PORTION] for first in range(0, len(pixels), _PORTION)]
-    return np.concatenate([encode_blocks(part) for part in parts])
+    parts = []
+    for first in range(0, len(pixels), _PORTION):
+        parts.append(encode_blocks(pixels[first : first + _PORTION]))
+        on_progress(min(first + _PORTION, len(pixels)) / len(pixels))
+    return np.concatenate(parts)
 
 
 def encode_blocks(pixels: Bytes) -> Bytes:

@@ -134,7 +134,7 @@ def test_what_is_delivered_lies_over_the_mesh_with_its_origin_under_the_thing(
     decision = find_subject(mesh.vertices, mesh.faces, gaze)
     assert decision.thing is not None
     told = as_dict(decision) | save_subject(
-        tmp_path, mesh, mesh, decision.thing, gaze, True, glb.GlbStyle(), lambda: None
+        tmp_path, mesh, mesh, decision.thing, gaze, True, glb.GlbStyle(), lambda done: None
     )
     assert problems_of(tmp_path / SUBJECT) == []
     assert told["num_faces"] < 0.3 * len(mesh.faces)

@@ -17,7 +17,7 @@ from pipelines.exports.formats.glb import GlbStyle, read_mesh, write_mesh
 from pipelines.exports.formats.srgb import linear_from_srgb
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from tests.gltf_validator import problems_of, report_of
-from tests.texture_pictures import psnr
+from tests.texture_pictures import photo, psnr
 
 VERTICES = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -300,6 +300,24 @@ def test_a_texture_may_be_a_ktx2(textured: Path, compressed: bool, tmp_path: Pat
     np.testing.assert_array_equal(
         ktx2.decode(data[begin : begin + view["byteLength"]]), found.texture
     )
+
+
+def test_what_the_told_share_raises_ends_a_ktx2_at_once_and_leaves_no_file(
+    textured: Path, tmp_path: Path
+) -> None:
+    plain, path, told = read_mesh(textured), tmp_path / "cancelled.glb", list[float]()
+    assert isinstance(plain, TexturedMesh)
+
+    def cancel(done: float) -> None:
+        told.append(done)
+        raise InterruptedError
+
+    large = dataclasses.replace(plain, texture=photo(512))
+    with pytest.raises(InterruptedError):
+        write_mesh(path, large, style=GlbStyle(texture="ktx2"), on_progress=cancel)
+    assert len(told) == 1
+    assert told[0] < 0.2
+    assert not list(tmp_path.glob("cancelled*"))
 
 
 def test_the_khronos_validator_knows_no_ktx2_and_finds_nothing_else(

@@ -73,6 +73,19 @@ def test_levels_come_back() -> None:
     assert psnr(ktx2.decode(memoryview(data)), picture) > 38.0
 
 
+def test_the_share_that_is_done_rises_to_1() -> None:
+    told: list[float] = []
+    blocks = uastc_encoder.encode(photo(512), told.append)
+    assert told == [0.25, 0.5, 0.75, 1.0]
+    np.testing.assert_array_equal(blocks, uastc_encoder.encode(photo(512)))
+    told.clear()
+    ktx2.encode(photo(512), told.append)
+    assert told == sorted({*told})
+    assert len(told) == 4 + 9 + 1  # of the picture, each of its levels, the file
+    assert told[0] == pytest.approx(0.25 * 0.75 * 0.95, rel=0.01)
+    assert told[-1] == 1.0
+
+
 def test_blocks_lie_row_by_row() -> None:
     picture = np.zeros((8, 12, 3), np.uint8)
     picture[:4, 8:] = (250, 10, 90)

@@ -338,7 +338,15 @@ def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -
 
 def test_every_glb_can_have_its_picture_as_a_ktx2(job: Workspace) -> None:
     wanted = {"glb_texture": "ktx2", "glb_compressed": True, "lods": 1, "texture_px": 1024}
-    summary = tiny_job.run(job, "mesh", **wanted)["summary"]
+    told: list[tuple[str, float]] = []
+    hooks = RunHooks(on_progress=lambda share, message, eta_s: told.append((message, share)))
+    summary = tiny_job.run_with(job, "mesh", hooks, **wanted)["summary"]
+    written = [
+        share for message, share in told if message in ("writing", "cutting out the subject")
+    ]
+    assert written == sorted(written)
+    assert len([share for share in written if 0.96 < share < 0.98]) > 8
+    assert len([share for share in written if share > 0.98]) > 4
     for name in ("mesh.glb", "mesh-lod1.glb", "subject.glb"):
         data = (job.stage("mesh") / name).read_bytes()
         assert b'"extensionsRequired":["KHR_mesh_quantization","EXT_meshopt_compression",' in data
