@@ -23,6 +23,7 @@ from pipelines.sample.scene import (
     pose_matrix,
     seen_surface,
     surface_distance,
+    surface_normals,
 )
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.orientation import Similarity
@@ -75,6 +76,21 @@ class SurfaceScores:
     things_recall: dict[float, float]
     accuracy: float
     completeness: float
+
+
+@dataclass(frozen=True)
+class NormalScores:
+    """How far normals are from the true surface's, of what lies within the first of `TOLERANCES`.
+
+    num_points: how many were compared. median_deg: of the angles. over_30_deg, turned: shares off
+    by more than 30 and by more than 90 degrees, which then point into the thing. All three are nan
+    where there are no points.
+    """
+
+    num_points: int
+    median_deg: float
+    over_30_deg: float
+    turned: float
 
 
 TOLERANCES = (0.01, 0.02)
@@ -195,6 +211,40 @@ def judge_surface(
         things_recall=_shares(missing[true_things], size),
         accuracy=float(np.median(off)) / size if len(off) else np.inf,
         completeness=float(np.median(missing)) / size,
+    )
+
+
+def judge_normals(
+    points: Floats,
+    normals: Floats,
+    alignment: Similarity,
+    truth: CamerasFile,
+    scene: Scene = SAMPLE,
+    num_points: int = 40_000,
+) -> NormalScores:
+    """The angles between normals and the true ones, where cameras looked.
+
+    points: [P, 3], normals: [P, 3] of any length above 0, in the frame that `alignment` moves to
+    the true world. num_points: so many of them are looked at, the same ones on every call.
+    """
+    if len(points) > num_points:
+        chosen = np.random.default_rng(0).choice(len(points), num_points, replace=False)
+        points, normals = points[chosen], normals[chosen]
+    moved = alignment.apply_to_points(np.asarray(points, np.float64))
+    kept = scene.subject.grown(scene.beyond).contains(moved)
+    kept[kept] = surface_distance(moved[kept], scene) <= TOLERANCES[0] * scene.subject.size
+    kept[kept] = _in_view(moved[kept], truth)
+    if not kept.any():
+        return NormalScores(0, np.nan, np.nan, np.nan)
+    found = alignment.apply_to_directions(np.asarray(normals, np.float64)[kept])
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    cosines = (found * surface_normals(moved[kept], scene)).sum(axis=1)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return NormalScores(
+        num_points=len(angles),
+        median_deg=float(np.median(angles)),
+        over_30_deg=float((angles > 30.0).mean()),
+        turned=float((angles > 90.0).mean()),
     )
 
 

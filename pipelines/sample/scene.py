@@ -60,6 +60,9 @@ ROOM = Region((-5.0, -4.5, 0.0), (5.0, 4.5, 3.4))
 _SAME = 1e-3
 """Of a distance: what is met by so much nearer than a point stands before it."""
 
+_STEP_M = 1e-5
+"""Between points whose distances tell a normal."""
+
 SCENE_SIZE_M = SUBJECT.size
 
 
@@ -335,35 +338,64 @@ def surface_distance(points: Floats, scene: Scene = SAMPLE) -> Floats:
     """
     best = np.full(len(points), np.inf)
     for thing in scene.primitives:
+        best = np.minimum(best, np.abs(_distance_to(thing, points)))
+    return best
+
+
+def surface_normals(points: Floats, scene: Scene = SAMPLE) -> Floats:
+    """What the true surface's normals are near points [N, 3], [N, 3] unit, into the open.
+
+    The gradient of the distance to what is solid, from differences; on both sides of a surface it
+    is the same.
+    """
+    gradient = np.stack(
+        [
+            _open_distance(points + step, scene) - _open_distance(points - step, scene)
+            for step in _STEP_M * np.eye(3)
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    unit: Floats = gradient / np.maximum(length, 1e-12)
+    return unit
+
+
+def _open_distance(points: Floats, scene: Scene) -> Floats:
+    """Distance of points [N, 3] to what is solid, [N], metres; negative within it."""
+    best = np.full(len(points), np.inf)
+    for thing in scene.primitives:
         best = np.minimum(best, _distance_to(thing, points))
     return best
 
 
 def _distance_to(thing: Primitive, points: Floats) -> Floats:
+    """[N], metres, from the surface of one thing; negative within it, and outside of a room."""
     yaw = math.radians(thing.yaw_deg)
     c, s = math.cos(yaw), math.sin(yaw)
     local = (points - thing.center) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     size = np.array(thing.size)
     if thing.kind == tracing.SPHERE:
-        return np.asarray(np.abs(np.linalg.norm(local, axis=1) - size[0]))
+        return np.asarray(np.linalg.norm(local, axis=1) - size[0])
     if thing.kind in (tracing.BOX, tracing.ROOM):
-        return _box_distance(np.abs(local), size)
+        distance = _box_distance(np.abs(local), size)
+        return -distance if thing.kind == tracing.ROOM else distance
     rho, z = np.hypot(local[:, 0], local[:, 1]), local[:, 2]
     if thing.kind == tracing.CYLINDER:
         return _box_distance(np.stack([rho, np.abs(z)], axis=1), size)
     if thing.kind == tracing.TORUS:
         ring = np.hypot(local[:, 0], z) - size[0]
-        return np.asarray(np.abs(np.hypot(ring, local[:, 1]) - size[1]))
+        return np.asarray(np.hypot(ring, local[:, 1]) - size[1])
     rim = np.hypot(rho - np.clip(rho, size[1], size[0]), z)
     radius = np.hypot(rho, z)
     shells = np.minimum(np.abs(radius - size[0]), np.abs(radius - size[1]))
-    distance: Floats = np.where(z <= 0.0, np.minimum(shells, rim), rim)
-    return distance
+    distance = np.where(z <= 0.0, np.minimum(shells, rim), rim)
+    solid = (z <= 0.0) & (radius >= size[1]) & (radius <= size[0])
+    return np.where(solid, -distance, distance)
 
 
 def _box_distance(folded: Floats, half: Floats) -> Floats:
-    """Unsigned distance to a box's surface; folded: coordinates by absolute value."""
+    """Distance to a box's surface, negative inside; folded: coordinates by absolute value."""
     beyond = folded - half
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
     inside = np.minimum(beyond.max(axis=1), 0.0)
-    return np.asarray(outside - inside)
+    return np.asarray(outside + inside)

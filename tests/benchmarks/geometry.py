@@ -13,8 +13,9 @@ that is finished already, made from that one CAPTURE; a scene's film must have h
 `--long-side`.
 
 Exact scenes: precision, recall and F-score of the mesh at 1 and 2 % of the size of the scene, only
-where cameras saw (`pipelines.sample.judge`), and depth at true cameras. Folders with depth: that
-at held-out views. All: what the job's report says of mesh and cloud against held-out photos.
+where cameras saw (`pipelines.sample.judge`), how far normals of mesh and cloud are off, and depth
+at true cameras. Folders with depth: that at held-out views. All: what the job's report says of mesh
+and cloud against held-out photos.
 Pictures: `depth.png` (photo | truth | mesh | error: red too near, blue too far, black missing) and
 `turntable.png` (the draft above the mesh, each coloured and shaded).
 """
@@ -41,8 +42,8 @@ from tests.benchmarks.scene_capture import scene_capture
 from tests.benchmarks.tables import markdown_table, number, write_json
 
 HEADER = (
-    "capture", "F 1 %", "F 2 %", "precision", "recall", "things", "depth right",
-    "covered", "mesh dB", "with holes", "model dB", "inconsistency", "seconds",
+    "capture", "F 1 %", "F 2 %", "precision", "recall", "things", "mesh deg", "cloud deg",
+    "depth right", "covered", "mesh dB", "with holes", "model dB", "inconsistency", "seconds",
 )  # fmt: skip
 
 
@@ -117,6 +118,10 @@ def row_of(found: dict[str, Any]) -> list[str]:
     mesh = (found.get("assets") or {}).get("mesh") or {}
     floaters = found["metrics"]["floaters"] or {}
 
+    def angle(name: str) -> str:
+        scores = None if surface is None else surface["normals"][name]
+        return number(None if scores is None else scores["median_deg"], 1)
+
     def share(name: str, tolerance: float) -> str:
         return number(None if surface is None else surface[name][tolerance], 3)
 
@@ -127,6 +132,8 @@ def row_of(found: dict[str, Any]) -> list[str]:
         share("precision", 0.02),
         share("recall", 0.02),
         share("things_precision", 0.02),
+        angle("mesh"),
+        angle("cloud"),
         number(depth.get("covered_and_within_5_percent"), 3),
         number(mesh.get("coverage"), 3),
         number(mesh.get("psnr")),

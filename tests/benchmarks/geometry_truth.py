@@ -18,15 +18,18 @@ from PIL import Image, UnidentifiedImageError
 
 from pipelines.captures.record import CaptureRecord
 from pipelines.exports.formats.ply import Ply, read_ply
+from pipelines.exports.frame import back_to_world
+from pipelines.exports.judged import cloud_of
 from pipelines.judging.asset_views import MeshCaster
 from pipelines.judging.depth_scores import depth_scores, nearest
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.sample.align import Floats
-from pipelines.sample.judge import judge_poses, judge_surface
+from pipelines.sample.judge import NormalScores, judge_normals, judge_poses, judge_surface
 from pipelines.sample.scene import depth_image, pose_matrix, render
 from pipelines.sample.takes import Take
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
+from pipelines.scene.orientation import Similarity
 from pipelines.scene.trained_scene import nerf_cameras
 from pipelines.workspace import Workspace
 
@@ -64,7 +67,14 @@ def judge_scene(job: Workspace, take: Take, truth: CamerasFile) -> tuple[dict[st
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
     mesh = read_ply(job.stage("mesh") / "mesh.ply")
     poses = judge_poses(cameras, truth)
-    points = mesh.points.astype(np.float64)
+    points = back_to_world(mesh.points, mesh.from_world)
+    cloud = cloud_of(job.stage("pointcloud"))
+    normals = {
+        "mesh": _judge_normals(mesh, poses.alignment, take, truth),
+        "cloud": _judge_normals(read_ply(cloud), poses.alignment, take, truth)
+        if cloud.is_file()
+        else None,
+    }
     surface = judge_surface(points, mesh.faces, poses.alignment, truth, take.scene)
     moved = poses.alignment.apply_to_points(points)
     compared = _depth_of_scene(moved, mesh, take, truth)
@@ -74,9 +84,23 @@ def judge_scene(job: Workspace, take: Take, truth: CamerasFile) -> tuple[dict[st
             "mean_center_error": poses.mean_center_error,
             "mean_rotation_error_deg": poses.mean_rotation_error_deg,
         },
-        "surface": asdict(surface),
+        "surface": asdict(surface)
+        | {"normals": {name: found and asdict(found) for name, found in normals.items()}},
         "depth": depth_scores(compared.found, compared.truth),
     }, compared
+
+
+def _judge_normals(
+    found: Ply, alignment: Similarity, take: Take, truth: CamerasFile
+) -> NormalScores | None:
+    """Of a mesh's vertices or of a cloud's points; None where the file has no normals."""
+    if found.normals is None:
+        return None
+    points, normals = back_to_world(found.points, found.from_world), found.normals
+    if found.from_world is not None:
+        # Turned back by the transpose, to which a similarity's inverse is proportional.
+        normals = normals @ found.from_world[:, :3]
+    return judge_normals(points, normals, alignment, truth, take.scene)
 
 
 def _depth_of_scene(vertices: Floats, mesh: Ply, take: Take, truth: CamerasFile) -> Compared:

@@ -14,7 +14,8 @@ from PIL import Image
 
 from pipelines.captures.record import CaptureRecord
 from pipelines.exports.formats import glb
-from pipelines.exports.formats.ply import write_mesh
+from pipelines.exports.formats.ply import write_mesh, write_points
+from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.sample.film import phone_camera, walk
 from pipelines.sample.scene import depth_image, pixel_rays, pose_matrix, raycast
@@ -40,18 +41,23 @@ REPORT: dict[str, Any] = {
 
 @pytest.fixture
 def job(tmp_path: Path) -> Workspace:
-    """A finished job whose mesh is the true surface, its whole world moved by SHIFT."""
+    """A finished job whose mesh is the true surface, its whole world moved by SHIFT.
+
+    The mesh's normals all point up, the cloud's are right, and that lies in a frame of its own.
+    """
     workspace = Workspace(tmp_path / "job")
-    for stage in ("ingest", "train", "mesh", "report"):
+    for stage in ("ingest", "train", "mesh", "pointcloud", "report"):
         workspace.stage(stage).mkdir(parents=True)
     truth = walk(FRAMES, phone_camera(LONG_SIDE), take=TAKE)
-    vertices, faces, offset, images = [], [], 0, []
+    vertices, normals, faces, offset, images = [], [], [], 0, []
     for number, image in enumerate(truth.images):
         pose = pose_matrix(image)
         y, x = np.mgrid[0:LONG_SIDE, 0 : truth.cameras[0].width]
         pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
         origins, directions = pixel_rays(truth.cameras[0], pose, pixels)
-        t = raycast(origins, directions, TAKE.scene).t
+        hits = raycast(origins, directions, TAKE.scene)
+        t = hits.t
+        normals.append(hits.normal)
         vertices.append(origins + t[:, None] * directions + SHIFT)
         index = np.arange(len(t)).reshape(x.shape)
         corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], -1)
@@ -68,6 +74,14 @@ def job(tmp_path: Path) -> Workspace:
     mesh = TriangleMesh(points, np.concatenate(faces).astype(np.int32), grey, upward)
     write_mesh(workspace.stage("mesh") / "mesh.ply", mesh)
     glb.write_mesh(workspace.stage("mesh") / "mesh.glb", mesh)
+    turned = np.array([[0.0, -2, 0, 7], [2, 0, 0, 8], [0, 0, 2, 9]])
+    frame = Frame(world="another", from_world=tuple(map(tuple, turned.tolist())))
+    write_points(
+        workspace.stage("pointcloud") / "pointcloud.ply",
+        points @ turned[:, :3].T + turned[:, 3],
+        normals=np.concatenate(normals) @ turned[:, :3].T / 2.0,
+        frame=frame,
+    )
     (workspace.stage("report") / "report.json").write_text(json.dumps(REPORT), "utf-8")
     return workspace
 
@@ -81,6 +95,11 @@ def test_a_finished_job_is_judged_without_running_it(job: Workspace, tmp_path: P
     assert found["poses"]["mean_center_error"] < 1e-6
     assert found["surface"]["precision"]["0.02"] > 0.99
     assert found["surface"]["recall"]["0.02"] > 0.9
+    normals = found["surface"]["normals"]
+    assert normals["cloud"]["num_points"] > 500
+    assert normals["cloud"]["median_deg"] < 0.1
+    assert normals["cloud"]["over_30_deg"] < 0.01
+    assert 0.2 < normals["mesh"]["over_30_deg"] < 0.9
     assert found["depth"]["within_5_percent"] > 0.98
     assert found["depth"]["coverage"] > 0.8
     assert found["job_s"] == 80.0

@@ -9,8 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.sample.film import phone_camera, walk
-from pipelines.sample.judge import judge_mesh, judge_poses
-from pipelines.sample.scene import SUBJECT, THINGS, Floats, depth_image, pixel_rays, pose_matrix
+from pipelines.sample.judge import judge_mesh, judge_normals, judge_poses
+from pipelines.sample.scene import (
+    SUBJECT,
+    THINGS,
+    Floats,
+    depth_image,
+    pixel_rays,
+    pose_matrix,
+    seen_surface,
+    surface_normals,
+)
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.orientation import Similarity
 
@@ -117,3 +126,60 @@ def test_half_a_mesh_is_accurate_but_not_complete() -> None:
 def test_an_empty_mesh_is_refused() -> None:
     with pytest.raises(ValueError, match="without faces"):
         judge_mesh(np.zeros((0, 3)), np.zeros((0, 3), int), IDENTITY, TRUTH)
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[Floats, Floats]:
+    """Points of the true surface that cameras saw, and its normals there."""
+    points = seen_surface(TRUTH, num_points=3000)
+    return points, surface_normals(points)
+
+
+def _tilted(normals: Floats, angle_deg: float) -> Floats:
+    """Unit normals turned by an angle, each about a line across it, at random."""
+    across = np.cross(normals, np.random.default_rng(0).normal(size=normals.shape))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    angle = np.radians(angle_deg)
+    tilted: Floats = np.cos(angle) * normals + np.sin(angle) * across
+    return tilted
+
+
+@pytest.mark.parametrize("angle", [10.0, 29.0, 31.0, 89.0, 91.0, 180.0])
+def test_normals_are_off_by_as_much_as_they_were_turned(
+    seen: tuple[Floats, Floats], angle: float
+) -> None:
+    points, normals = seen
+    scores = judge_normals(points, 3.0 * _tilted(normals, angle), IDENTITY, TRUTH)
+    assert scores.num_points > 0.99 * len(points)
+    assert scores.median_deg == pytest.approx(angle, abs=0.01)
+    assert scores.over_30_deg == float(angle > 30.0)
+    assert scores.turned == float(angle > 90.0)
+
+
+def test_a_share_of_wrong_normals_counts_as_such(seen: tuple[Floats, Floats]) -> None:
+    points, normals = seen
+    wrong, number = _tilted(normals, 4.0), np.arange(len(points))
+    wrong[number % 5 == 0] *= -1.0
+    wrong[number % 5 == 1] = _tilted(normals, 60.0)[number % 5 == 1]
+    scores = judge_normals(points, wrong, IDENTITY, TRUTH)
+    assert scores.median_deg == pytest.approx(4.0, abs=0.01)
+    assert scores.over_30_deg == pytest.approx(0.4, abs=0.01)
+    assert scores.turned == pytest.approx(0.2, abs=0.01)
+
+
+def test_normals_are_judged_in_the_true_world_and_near_its_surface_alone(
+    seen: tuple[Floats, Floats],
+) -> None:
+    points, normals = seen
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    move = Similarity(quarter, np.array([1.0, 2, 3]), 0.5)
+    there = (points - move.translation) @ quarter / 0.5
+    scores = judge_normals(there, normals @ quarter, move, TRUTH, num_points=1000)
+    assert scores.num_points == pytest.approx(1000, abs=20)
+    assert scores.median_deg < 0.1
+    # 1.5 % of the size before the surface nothing is compared, nor is there anything to tell.
+    far = judge_normals(points + 0.015 * SUBJECT.size * normals, normals, IDENTITY, TRUTH)
+    assert far.num_points < 0.1 * len(points)
+    nothing = judge_normals(points + 50.0, normals, IDENTITY, TRUTH)
+    assert nothing.num_points == 0
+    assert np.isnan(nothing.median_deg)

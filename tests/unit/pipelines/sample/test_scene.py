@@ -19,6 +19,7 @@ from pipelines.sample.scene import (
     render,
     seen_surface,
     surface_distance,
+    surface_normals,
 )
 from pipelines.scene.cameras_file import Intrinsics
 
@@ -73,6 +74,18 @@ def test_normals_are_the_gradient_of_the_distance() -> None:
     agreement = np.einsum("nk,nk->n", gradient, hits.normal)
     # Within 0.1 mm of a crease another surface may be the nearer one.
     assert np.mean(agreement > 1 - 1e-6) > 0.995
+
+
+def test_true_normals_are_those_of_hits_on_both_sides_of_a_surface() -> None:
+    origins, directions = _rays(4000, seed=2)
+    hits = raycast(origins, directions)
+    for off in (-1e-3, 0.0, 1e-3):
+        points = origins + hits.t[:, None] * directions + off * hits.normal
+        found = surface_normals(points)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0)
+        # Within 1 mm of a crease another surface may be the nearer one.
+        agreement = np.einsum("nk,nk->n", found, hits.normal)
+        assert np.mean(agreement > 1 - 1e-6) > 0.98
 
 
 def test_surface_distance_equals_a_search_over_surface_points() -> None:
