@@ -390,7 +390,8 @@ def _distance_to(thing: Primitive, points: Floats) -> Floats:
     shells = np.minimum(np.abs(radius - size[0]), np.abs(radius - size[1]))
     distance = np.where(z <= 0.0, np.minimum(shells, rim), rim)
     solid = (z <= 0.0) & (radius >= size[1]) & (radius <= size[0])
-    return np.where(solid, -distance, distance)
+    signed: Floats = np.where(solid, -distance, distance)
+    return signed
 
 
 def _box_distance(folded: Floats, half: Floats) -> Floats:

@@ -96,7 +96,8 @@ def _judge_normals(
     """Of a mesh's vertices or of a cloud's points; None where the file has no normals."""
     if found.normals is None:
         return None
-    points, normals = back_to_world(found.points, found.from_world), found.normals
+    points = back_to_world(found.points, found.from_world)
+    normals = found.normals.astype(np.float64)
     if found.from_world is not None:
         # Turned back by the transpose, to which a similarity's inverse is proportional.
         normals = normals @ found.from_world[:, :3]

@@ -78,10 +78,13 @@ def thinned(cloud: Cloud, at_most: int, seed: int) -> Cloud:
     return cloud.take(np.sort(rng.choice(len(cloud), at_most, replace=False)))
 
 
-def oriented_normals(cloud: Cloud, origin: Floats) -> Floats:
-    """Unit normals [P, 3] from each point's neighbours, turned to the camera that saw it."""
+def oriented_normals(cloud: Cloud, origin: Floats, neighbours: int = _NEIGHBOURS) -> Floats:
+    """Unit normals [P, 3] from each point's neighbours, turned to the camera that saw it.
+
+    neighbours: so many, the point among them; more are smoother, on edges too.
+    """
     legacy = _legacy(cloud, origin)
-    legacy.estimate_normals(_geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
+    legacy.estimate_normals(_geometry.KDTreeSearchParamKNN(neighbours))
     normals = np.asarray(legacy.normals, np.float64)
     to_eye = cloud.eyes - cloud.points
     # Too few neighbours give a zero normal: then the view direction is the best that is known.

@@ -39,6 +39,18 @@ def test_points_and_normals_of_a_sphere_are_exact(views: list[DepthView]) -> Non
     assert (normals * outward).sum(axis=1).min() > 0.0
 
 
+def test_more_neighbours_make_normals_of_noisy_points_smoother() -> None:
+    rng = np.random.default_rng(0)
+    plane = np.column_stack([rng.random((4000, 2)), 0.01 * rng.standard_normal(4000)])
+    eyes = np.tile([0.5, 0.5, 3.0], (4000, 1))
+    cloud = Cloud(plane, np.zeros((4000, 3), np.uint8), eyes)
+    few, many = (oriented_normals(cloud, np.zeros(3), count)[:, 2] for count in (20, 40))
+    assert min(few.min(), many.min()) >= 0.0
+    off_by, then = (float(np.median(np.arccos(np.clip(up, -1, 1)))) for up in (few, many))
+    # A plane's slope is told by as many, over as much more area: both count by their root.
+    assert then == pytest.approx(off_by / 2.0, rel=0.15)
+
+
 def test_a_point_far_from_all_others_goes(views: list[DepthView]) -> None:
     cloud = gather(views, BOUNDS)
     lonely = Cloud(
