@@ -52,6 +52,9 @@ _PREVIEW_LONG_SIDE = 320
 _PSNR_STEPS = 50
 _CHECKPOINT, _PROGRESS = "training.pt", "progress.json"
 _TRAIN_SHARE = 0.98
+_ALL_ROUND_DEG = 120.0
+"""Between the directions of two cameras, for plain lines: of what is seen from one side what the
+maps mistake at the rims of things goes on into all that is plain (docs/surfaces.md)."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +113,9 @@ def decided(config: TrainConfig, capture: CamerasFile) -> TrainConfig:
     if config.flat.when != "around":
         return config
     shown = [image for image in capture.images if image.split == "train"]
-    gaze = gaze_of(shown, [capture.cameras[image.camera] for image in shown])
-    when = "always" if told_by_cameras(gaze).why is None else "never"
+    told = told_by_cameras(gaze_of(shown, [capture.cameras[image.camera] for image in shown]))
+    around = told.why is None and told.measures["arc_deg"] >= _ALL_ROUND_DEG
+    when = "always" if around else "never"
     return replace(config, flat=replace(config.flat, when=when))
 
 

@@ -108,8 +108,9 @@ class FlatLossConfig:
 
     when: str = option(
         "around",
-        "around: where the cameras stand around what they look at, by the rule for subjects; the "
-        "library alone, which does not know that, takes it for never.",
+        "around: where the cameras stand around what they look at, by the rule for subjects, and "
+        "two of them 120 degrees apart; the library alone, which does not know that, takes it for "
+        "never.",
         choices=("around", "always", "never"),
     )
     weight: float = option(
