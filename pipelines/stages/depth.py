@@ -28,11 +28,11 @@ from pipelines.nerf.data.light import Light
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, config_from_dict
+from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.engines import Engine, TorchEngine, choose_engine
 from pipelines.nerf.stereo.light import find_light
 from pipelines.nerf.stereo.maps import MapShelf, Progress, find_depth_maps, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
-from pipelines.nerf.stereo.planes import completed
 from pipelines.nerf.stereo.sensor import merged_maps, sensor_maps, sensor_scale
 from pipelines.nerf.stereo.shelves import Shelf
 from pipelines.nerf.stereo.standing import stood_up

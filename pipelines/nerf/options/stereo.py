@@ -66,3 +66,9 @@ class StereoConfig:
         "that several views see in the same place, and other views agree; and where neighbours see "
         "such a wall.",
     )
+    level_tops: bool = option(
+        True,
+        "Lay plain table tops at the height of their rims: patches of even brightness, of which "
+        "half of what is known lies at one height above a level plane, in several views. Part of "
+        "complete_planes.",
+    )

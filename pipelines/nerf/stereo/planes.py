@@ -17,20 +17,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
-from pipelines.nerf.stereo.engines import KERNELS, Engine
-from pipelines.nerf.stereo.maps import (
-    DepthMap,
-    MapShelf,
-    Progress,
-    depths_of,
-    surface_points,
-    votes_of_others,
-)
-from pipelines.nerf.stereo.neighbours import choose_neighbours
-from pipelines.nerf.stereo.patches import Labels, patches_of
-from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
+from pipelines.nerf.stereo.maps import DepthMap
+from pipelines.nerf.stereo.patches import Labels
+from pipelines.nerf.stereo.shelves import ByView
 from pipelines.nerf.stereo.views import StereoView
 
 Depths = NDArray[np.float32]
@@ -43,89 +32,8 @@ ON_PLANE, _ALIGNED = 0.01, 0.9
 """How near a point is to its plane, relative to its depth; |cosine| between their normals."""
 _MOST_PLANES, _HYPOTHESES, _LEAST_SHARE = 24, 300, 0.01
 _MIN_KNOWN, _MIN_SHARE = 30, 0.5
-_SAMPLES_SHARE, _VOTES_SHARE = 0.25, 0.35
-_MESSAGE = "completing plain surfaces"
 _EXTRAPOLATED = 3.0
 """How much nearer or farther than all its known pixels a patch may reach."""
-
-
-def completed(
-    views: Sequence[StereoView],
-    maps: MapShelf,
-    config: StereoConfig,
-    on_progress: Progress = lambda fraction, message: None,
-    engine: Engine = KERNELS,
-    shelves: Shelves = MEMORY,
-    patches: Shelf | None = None,
-) -> MapShelf:
-    """The maps with their plain patches on the planes of the scene.
-
-    Depths within 1 % of their patch's plane move onto it; unknown pixels of the patch get its depth
-    unless more neighbours see through it than agree. All others stay as they are. patches: a shelf
-    for the pictures' `patches_of`, or with them.
-    """
-    planes = find_planes(views, maps, lambda f: on_progress(_SAMPLES_SHARE * f, _MESSAGE))
-    if len(planes) == 0:
-        return maps
-    points = surface_points(views, depths_of(maps))
-    neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
-    filled = shelves.scratch("on planes", len(views))
-    for index, (view, z) in enumerate(zip(views, depths_of(maps), strict=True)):
-        filled[index] = laid_on_planes(view, z, planes, shelved_patches(view, index, patches))
-        share = (1.0 - _VOTES_SHARE - _SAMPLES_SHARE) * (index + 1) / len(views)
-        on_progress(_SAMPLES_SHARE + share, _MESSAGE)
-    return confirmed(
-        views,
-        maps,
-        filled,
-        neighbours,
-        config,
-        lambda agree, through: agree < through,
-        lambda done: on_progress(1.0 - _VOTES_SHARE * (1.0 - done), _MESSAGE),
-        engine,
-        MapShelf.kept(shelves, "planes", len(views), fresh=True),
-    )
-
-
-def shelved_patches(view: StereoView, index: int, shelf: Shelf | None) -> Labels:
-    """`patches_of` a view's picture, found once where there is a shelf for them."""
-    if shelf is None:
-        return patches_of(view.picture)
-    if not shelf.has(index):
-        shelf[index] = patches_of(view.picture)
-    found: Labels = shelf[index]
-    return found
-
-
-def confirmed(
-    views: Sequence[StereoView],
-    maps: ByView[DepthMap],
-    filled: ByView[Depths],
-    neighbours: Sequence[Sequence[int]],
-    config: StereoConfig,
-    refutes: Callable[[NDArray[np.int32], NDArray[np.int32]], NDArray[np.bool_]],
-    on_progress: Callable[[float], None],
-    engine: Engine,
-    kept: MapShelf,
-) -> MapShelf:
-    """The filled maps, as the maps were where neighbours refute a depth that is new, on `kept`.
-
-    refutes: of the numbers of neighbours, [H, W] each, that agree and that see through.
-    on_progress: told the share that is done; may raise.
-    """
-    for index, found in enumerate(maps):
-        votes, _ = votes_of_others(
-            filled[index], index, views, filled, neighbours[index], config, engine
-        )
-        moved = np.abs(filled[index] - found.z) > 2.0 * ON_PLANE * found.z
-        guessed = (filled[index] > 0) & moved
-        refuted = guessed & refutes(votes[AGREE], votes[SEE_THROUGH])
-        kept[index] = DepthMap(
-            np.where(refuted, found.z, filled[index]),
-            np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
-        )
-        on_progress((index + 1) / len(views))
-    return kept
 
 
 def find_planes(
@@ -164,7 +72,7 @@ def planes_and_samples(
             members = _on_plane(plane, points, normals, depths)
             if members.sum() < _MIN_KNOWN:
                 break
-            plane = _fitted(points[members], 1.0 / depths[members])
+            plane = fitted(points[members], 1.0 / depths[members])
         if _on_plane(plane, points, normals, depths).sum() < least:
             break
         planes.append(plane)
@@ -324,7 +232,7 @@ def _on_plane(
     return on
 
 
-def _fitted(points: Floats, weights: Floats) -> Floats:
+def fitted(points: Floats, weights: Floats) -> Floats:
     """The plane [4] of least weighted squared distance to the points [K, 3]."""
     middle = weights @ points / weights.sum()
     _, _, axes = np.linalg.svd((points - middle) * weights[:, None], full_matrices=False)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from skimage.segmentation import expand_labels
 
 from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.completing import confirmed, shelved_patches
 from pipelines.nerf.stereo.engines import KERNELS, Engine
 from pipelines.nerf.stereo.maps import MapShelf, Progress, depths_of, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
@@ -31,11 +32,9 @@ from pipelines.nerf.stereo.patches import Labels, even_patches
 from pipelines.nerf.stereo.planes import (
     ON_PLANE,
     Floats,
-    confirmed,
     inverse_depths,
     planes_and_samples,
     ray_grid,
-    shelved_patches,
 )
 from pipelines.nerf.stereo.shelves import MEMORY, Shelf, Shelves
 from pipelines.nerf.stereo.spreading import (

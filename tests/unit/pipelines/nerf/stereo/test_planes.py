@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
-from pipelines.nerf.stereo.planes import completed, find_planes
+from pipelines.nerf.stereo.planes import find_planes
 from pipelines.nerf.stereo.views import StereoView
 from tests.unit.pipelines.nerf.stereo.painted_wall import BOX, SLOPE, WALL, row_of_cameras
 

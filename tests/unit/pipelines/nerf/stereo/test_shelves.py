@@ -10,9 +10,9 @@ import pytest
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo import shelves as module
+from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.engines import KernelEngine
 from pipelines.nerf.stereo.maps import find_depth_maps
-from pipelines.nerf.stereo.planes import completed
 from pipelines.nerf.stereo.shelves import MEMORY, FileShelves, Shelves
 from tests.unit.pipelines.nerf.stereo.painted_wall import row_of_cameras
 from tests.unit.pipelines.nerf.stereo.test_maps import known_points

@@ -1,0 +1,146 @@
+"""Plain surfaces, which nothing can match, completed by what the whole scene shows.
+
+Planes that many known points lie on (`stereo.planes`), then table tops of which hardly more than
+the rim is known (`stereo.tops`). Symbols as in `stereo.planes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
+from pipelines.nerf.stereo.engines import KERNELS, Engine
+from pipelines.nerf.stereo.maps import (
+    DepthMap,
+    MapShelf,
+    Progress,
+    depths_of,
+    surface_points,
+    votes_of_others,
+)
+from pipelines.nerf.stereo.neighbours import choose_neighbours
+from pipelines.nerf.stereo.patches import Labels, even_patches, patches_of
+from pipelines.nerf.stereo.planes import ON_PLANE, Depths, Floats, find_planes, laid_on_planes
+from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
+from pipelines.nerf.stereo.tops import Rims, laid_on_tops, upwards
+from pipelines.nerf.stereo.views import StereoView
+
+_SAMPLES_SHARE, _LAID_SHARE, _TOPS_SHARE = 0.2, 0.55, 0.7
+"""Of the progress, at the end of each part; the votes come last."""
+_MESSAGE = "completing plain surfaces"
+
+
+def completed(
+    views: Sequence[StereoView],
+    maps: MapShelf,
+    config: StereoConfig,
+    on_progress: Progress = lambda fraction, message: None,
+    engine: Engine = KERNELS,
+    shelves: Shelves = MEMORY,
+    patches: Shelf | None = None,
+) -> MapShelf:
+    """The maps with their plain patches on the planes and table tops of the scene.
+
+    Depths within 1 % of their patch's plane move onto it; unknown pixels of the patch get its depth
+    unless more neighbours see through it than agree. All others stay as they are, but for those on
+    table tops that are their surroundings' (`laid_on_tops`). patches: a shelf for the pictures'
+    `patches_of`, or with them.
+    """
+    planes = find_planes(views, maps, lambda f: on_progress(_SAMPLES_SHARE * f, _MESSAGE))
+    if len(planes) == 0:
+        return maps
+
+    def share_done(begin: float, end: float, share: float) -> None:
+        on_progress(begin + (end - begin) * share, _MESSAGE)
+
+    filled = shelves.scratch("on planes", len(views))
+    for index, (view, z) in enumerate(zip(views, depths_of(maps), strict=True)):
+        filled[index] = laid_on_planes(view, z, planes, shelved_patches(view, index, patches))
+        share_done(_SAMPLES_SHARE, _LAID_SHARE, (index + 1) / len(views))
+    if config.level_tops:
+        on_share = partial(share_done, _LAID_SHARE, _TOPS_SHARE)
+        _lay_on_tops(views, filled, planes, patches, on_share)
+    points = surface_points(views, depths_of(maps))
+    neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
+    return confirmed(
+        views,
+        maps,
+        filled,
+        neighbours,
+        config,
+        lambda agree, through: agree < through,
+        partial(share_done, _TOPS_SHARE, 1.0),
+        engine,
+        MapShelf.kept(shelves, "planes", len(views), fresh=True),
+    )
+
+
+def shelved_patches(view: StereoView, index: int, shelf: Shelf | None) -> Labels:
+    """`patches_of` a view's picture, found once where there is a shelf for them."""
+    if shelf is None:
+        return patches_of(view.picture)
+    if not shelf.has(index):
+        shelf[index] = patches_of(view.picture)
+    found: Labels = shelf[index]
+    return found
+
+
+def confirmed(
+    views: Sequence[StereoView],
+    maps: ByView[DepthMap],
+    filled: ByView[Depths],
+    neighbours: Sequence[Sequence[int]],
+    config: StereoConfig,
+    refutes: Callable[[NDArray[np.int32], NDArray[np.int32]], NDArray[np.bool_]],
+    on_progress: Callable[[float], None],
+    engine: Engine,
+    kept: MapShelf,
+) -> MapShelf:
+    """The filled maps, as the maps were where neighbours refute a depth that is new, on `kept`.
+
+    refutes: of the numbers of neighbours, [H, W] each, that agree and that see through.
+    on_progress: told the share that is done; may raise.
+    """
+    for index, found in enumerate(maps):
+        votes, _ = votes_of_others(
+            filled[index], index, views, filled, neighbours[index], config, engine
+        )
+        moved = np.abs(filled[index] - found.z) > 2.0 * ON_PLANE * found.z
+        guessed = (filled[index] > 0) & moved
+        refuted = guessed & refutes(votes[AGREE], votes[SEE_THROUGH])
+        kept[index] = DepthMap(
+            np.where(refuted, found.z, filled[index]),
+            np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),
+        )
+        on_progress((index + 1) / len(views))
+    return kept
+
+
+def _lay_on_tops(
+    views: Sequence[StereoView],
+    depths: Shelf,
+    planes: Floats,
+    patches: Shelf | None,
+    on_share: Callable[[float], None],
+) -> None:
+    """Lay the maps on their shelf on table tops, if there are any."""
+    normal = upwards(views, planes)
+    if normal is None:
+        return
+    rims = Rims()
+    for index, view in enumerate(views):
+        even = even_patches(view.picture, shelved_patches(view, index, patches))
+        rims.add(view, depths[index], even)
+        on_share(0.5 * (index + 1) / len(views))
+    tops = rims.tops(normal, planes)
+    if len(tops) == 0:
+        return
+    for index, view in enumerate(views):
+        even = even_patches(view.picture, shelved_patches(view, index, patches))
+        depths[index] = laid_on_tops(view, depths[index], tops, even)
+        on_share(0.5 + 0.5 * (index + 1) / len(views))

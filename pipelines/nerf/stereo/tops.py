@@ -1,0 +1,211 @@
+"""Plain table tops, which nothing can match, laid where their rims lie.
+
+The top of a white table has no known point but for its rim and for what lies at the foot of the
+things on it. Both are level, and so they tell at what height the top is, although they are too few,
+and lie too much like an edge, to be found as a plane among all that is known. So heights above a
+level plane of the scene are sought at which half of what is known of plain patches lies, in several
+views; and in each view such a patch is laid there, between what is known of it and no farther: the
+wall behind a chest begins at the chest's height, too.
+
+Symbols as in `stereo.planes`: planes [P, 4] (n, d) with n . X = d, n of length 1, in the world.
+Depth is along the camera's axis (z), 0 where unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.morphology import convex_hull_image
+from skimage.segmentation import expand_labels
+
+from pipelines.nerf.stereo.patches import Labels
+from pipelines.nerf.stereo.planes import ON_PLANE, Depths, Floats, fitted, inverse_depths, ray_grid
+from pipelines.nerf.stereo.views import StereoView
+
+Bools = NDArray[np.bool_]
+
+_LEVEL = 0.8
+_LEAST_AREA, _MOST_KNOWN, _LEAST_KNOWN, _LEAST_ON = 0.01, 0.5, 30, 0.5
+"""A patch counts if it is so large, of the picture, no more than half of it is known, but so many
+pixels are; it lies at a height if so many of these do."""
+_LEAST_VIEWS, _LEAST_VIEW_SHARE, _MOST_TOPS = 3, 0.05, 4
+_STEPS_PER_DEPTH = 400
+"""Heights tried, per median depth."""
+_MOST_TILT_DEG = 3.0
+_APART = 4.0 * ON_PLANE
+"""Planes nearer to each other than this, by the depth, are one."""
+_FATTENED_PX = 8
+"""Matching takes squares and carries depths on, so what lies within so many pixels of a patch's
+border may have the depth that is beyond it."""
+
+
+@dataclass(frozen=True)
+class _Rim:
+    """What is known of a plain patch: points [K, 3], world, and their depths [K]; of which view."""
+
+    view: int
+    points: Floats
+    depths: Floats
+
+
+class Rims:
+    """What is known of the plain patches of all views, gathered view by view."""
+
+    def __init__(self) -> None:
+        self._rims: list[_Rim] = []
+        self._num_views = 0
+
+    def add(self, view: StereoView, z: Depths, patches: Labels) -> None:
+        """The next view's. patches: [H, W], of its picture."""
+        x, y = ray_grid(view)
+        for patch in _open_patches(z, patches):
+            row, column = np.nonzero((patches == patch) & (z > 0))
+            depth = z[row, column].astype(np.float64)
+            local = np.stack([x[column] * depth, y[row, 0] * depth, depth], axis=-1)
+            points = local @ view.world_from_camera[:, :3].T + view.center
+            self._rims.append(_Rim(self._num_views, points, depth))
+        self._num_views += 1
+
+    def tops(self, normal: Floats, planes: Floats) -> Floats:
+        """The planes [T, 4] about at right angles to `normal` that plain patches lie on by what is
+        known of them, the one of most patches first, without those that `planes` [P, 4] has.
+        """
+        left, found = list(self._rims), [np.zeros((0, 4))]
+        level = planes[np.abs(planes[:, :3] @ normal) > np.cos(np.radians(_MOST_TILT_DEG))]
+        level = level * np.sign(level[:, :3] @ normal)[:, None]
+        for _ in range(_MOST_TOPS):
+            height = self._best_height(left, normal)
+            if height is None:
+                break
+            members = [rim for rim in left if _share_at(rim, normal, height) >= _LEAST_ON]
+            if not members:
+                break
+            left = [rim for rim in left if not any(rim is member for member in members)]
+            plane = _fitted_to(members, np.append(normal, height))
+            points = np.concatenate([rim.points for rim in members])
+            depths = np.concatenate([rim.depths for rim in members])
+            at = np.abs(points @ plane[:3] - plane[3]) < ON_PLANE * depths
+            apart = np.abs(points[at] @ level[:, :3].T - level[:, 3]) / depths[at, None]
+            if not (np.median(apart, axis=0) < _APART).any():
+                found.append(plane[None])
+                level = np.concatenate([level, plane[None]])
+        return np.concatenate(found)
+
+    def _best_height(self, rims: Sequence[_Rim], normal: Floats) -> float | None:
+        """That at which most patches lie, if they are of enough views."""
+        if not rims:
+            return None
+        heights = [rim.points @ normal for rim in rims]
+        step = float(np.median(np.concatenate([rim.depths for rim in rims]))) / _STEPS_PER_DEPTH
+        low = min(float(height.min()) for height in heights) - step
+        high = max(float(height.max()) for height in heights) + step
+        num = min(int((high - low) / step) + 2, 200_000)
+        at_views = np.zeros((self._num_views, num), bool)
+        for rim, height in zip(rims, heights, strict=True):
+            reach = 2.0 * ON_PLANE * rim.depths
+            begin = np.clip(np.ceil((height - reach - low) / step), 0, num - 1).astype(int)
+            end = np.clip(np.floor((height + reach - low) / step) + 1, 0, num - 1).astype(int)
+            count = np.bincount(begin, minlength=num) - np.bincount(end, minlength=num)
+            at_views[rim.view] |= np.cumsum(count) >= _LEAST_ON * len(height)
+        num_views = at_views.sum(axis=0)
+        most = int(num_views.max())
+        if most < max(_LEAST_VIEWS, _LEAST_VIEW_SHARE * self._num_views):
+            return None
+        return low + step * _middle_of_longest_run(np.flatnonzero(num_views == most))
+
+
+def _middle_of_longest_run(numbers: NDArray[np.int64]) -> float:
+    """Of rising numbers, the middle one of the longest row that has no gaps."""
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    longest = max(runs, key=len)
+    return float(longest[len(longest) // 2])
+
+
+def upwards(views: Sequence[StereoView], planes: Floats) -> Floats | None:
+    """The normal [3], upwards, of the first of the planes that is about level, if any.
+
+    Which way is up: as the pictures have it in the mean.
+    """
+    up = np.mean([-view.world_from_camera[:, 1] for view in views], axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    level = planes[:, :3] @ up
+    flat = np.flatnonzero(np.abs(level) >= _LEVEL)
+    if not len(flat):
+        return None
+    normal: Floats = planes[flat[0], :3] * np.sign(level[flat[0]])
+    return normal
+
+
+def laid_on_tops(view: StereoView, z: Depths, tops: Floats, patches: Labels) -> Depths:
+    """A depth map [H, W] with its plain patches on those of the tops [T, 4] that half of what is
+    known of them lies on, between these pixels.
+
+    Where the depth is that of what lies beyond the patch's border, close by, it is not the patch's.
+    """
+    laid = z.copy()
+    hull_of: Any = convex_hull_image
+    inverses = inverse_depths(view, tops, *ray_grid(view))
+    off = np.stack([np.abs(_heights(view, z, top)) for top in tops])
+    for patch in _open_patches(z, patches):
+        own = patches == patch
+        near = own & (z > 0) & (off < 2.0 * ON_PLANE * z)
+        best = int(near.sum(axis=(1, 2)).argmax())
+        if near[best].sum() < _LEAST_ON * (own & (z > 0)).sum():
+            continue
+        inverse = inverses[best]
+        within = own & hull_of(near[best]) & (inverse > 1e-9) & (view.picture >= 0.0)
+        within &= (z == 0) | near[best] | _carried_in(z, own)
+        laid[within] = (1.0 / inverse[within]).astype(np.float32)
+    return laid
+
+
+def _heights(view: StereoView, z: Depths, top: Floats) -> Floats:
+    """[H, W]: how far above a plane each known pixel's point is."""
+    x, y = ray_grid(view)
+    a, b, c = top[:3] @ view.world_from_camera[:, :3]
+    heights: Floats = z * (a * x + b * y + c) + (top[:3] @ view.center - top[3])
+    return heights
+
+
+def _carried_in(z: Depths, own: Bools) -> Bools:
+    """[H, W]: where a patch has the depth that is known beyond its border, close by."""
+    places = np.arange(z.size).reshape(z.shape) + 1
+    expand: Any = expand_labels
+    nearest = expand(np.where((z > 0) & ~own, places, 0), _FATTENED_PX)
+    beyond = z.ravel()[nearest - 1]
+    same = np.abs(z - beyond) < 2.0 * ON_PLANE * beyond
+    carried: Bools = own & (z > 0) & (nearest > 0) & same
+    return carried
+
+
+def _open_patches(z: Depths, patches: Labels) -> NDArray[np.int64]:
+    num = int(patches.max()) + 1
+    area = np.bincount(patches.ravel(), minlength=num)
+    known = np.bincount(patches[z > 0], minlength=num)
+    large = area >= _LEAST_AREA * patches.size
+    return np.flatnonzero(large & (known >= _LEAST_KNOWN) & (known < _MOST_KNOWN * area))
+
+
+def _share_at(rim: _Rim, normal: Floats, height: float) -> float:
+    return float((np.abs(rim.points @ normal - height) <= 2.0 * ON_PLANE * rim.depths).mean())
+
+
+def _fitted_to(rims: Sequence[_Rim], level: Floats) -> Floats:
+    """The plane [4] of what the patches' known points agree on, near the level one."""
+    points = np.concatenate([rim.points for rim in rims])
+    depths = np.concatenate([rim.depths for rim in rims])
+    plane = level
+    for _ in range(5):
+        at = np.abs(points @ plane[:3] - plane[3]) < ON_PLANE * depths
+        if at.sum() < _LEAST_KNOWN:
+            return level
+        plane = fitted(points[at], 1.0 / depths[at])
+        plane = plane * np.sign(plane[:3] @ level[:3])
+        if plane[:3] @ level[:3] < np.cos(np.radians(_MOST_TILT_DEG)):
+            heights = np.median((points @ level[:3])[at])
+            return np.append(level[:3], heights)
+    return plane
