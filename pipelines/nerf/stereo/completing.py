@@ -25,7 +25,14 @@ from pipelines.nerf.stereo.maps import (
 )
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.patches import Labels, even_patches, patches_of
-from pipelines.nerf.stereo.planes import ON_PLANE, Depths, Floats, find_planes, laid_on_planes
+from pipelines.nerf.stereo.planes import (
+    ON_PLANE,
+    Depths,
+    Floats,
+    floors_of,
+    laid_on_planes,
+    planes_and_samples,
+)
 from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
 from pipelines.nerf.stereo.tops import Rims, laid_on_tops, upwards
 from pipelines.nerf.stereo.views import StereoView
@@ -51,7 +58,9 @@ def completed(
     table tops that are their surroundings' (`laid_on_tops`). patches: a shelf for the pictures'
     `patches_of`, or with them.
     """
-    planes = find_planes(views, maps, lambda f: on_progress(_SAMPLES_SHARE * f, _MESSAGE))
+    planes, points, depths = planes_and_samples(
+        views, maps, lambda f: on_progress(_SAMPLES_SHARE * f, _MESSAGE)
+    )
     if len(planes) == 0:
         return maps
 
@@ -62,11 +71,13 @@ def completed(
     for index, (view, z) in enumerate(zip(views, depths_of(maps), strict=True)):
         filled[index] = laid_on_planes(view, z, planes, shelved_patches(view, index, patches))
         share_done(_SAMPLES_SHARE, _LAID_SHARE, (index + 1) / len(views))
-    if config.level_tops:
+    normal = upwards(views, planes) if config.level_tops else None
+    if normal is not None:
         on_share = partial(share_done, _LAID_SHARE, _TOPS_SHARE)
-        _lay_on_tops(views, filled, planes, patches, on_share)
-    points = surface_points(views, depths_of(maps))
-    neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
+        floors = planes[floors_of(views, planes, points, depths)]
+        _lay_on_tops(views, depths_of(maps), (normal, floors), filled, patches, on_share)
+    seen = surface_points(views, depths_of(maps))
+    neighbours = choose_neighbours(views, seen, config.num_neighbours, config.best_angle_deg)
     return confirmed(
         views,
         maps,
@@ -123,24 +134,25 @@ def confirmed(
 
 def _lay_on_tops(
     views: Sequence[StereoView],
-    depths: Shelf,
-    planes: Floats,
+    depths: ByView[Depths],
+    floor: tuple[Floats, Floats],
+    filled: Shelf,
     patches: Shelf | None,
     on_share: Callable[[float], None],
 ) -> None:
-    """Lay the maps on their shelf on table tops, if there are any."""
-    normal = upwards(views, planes)
-    if normal is None:
-        return
+    """Lay maps on table tops, if there are any; what changes goes onto the shelf `filled`.
+
+    floor: what `Rims.tops` is told of it.
+    """
     rims = Rims()
-    for index, view in enumerate(views):
-        even = even_patches(view.picture, shelved_patches(view, index, patches))
-        rims.add(view, depths[index], even)
+    for index, (view, z) in enumerate(zip(views, depths, strict=True)):
+        rims.add(view, z, even_patches(view.picture, shelved_patches(view, index, patches)))
         on_share(0.5 * (index + 1) / len(views))
-    tops = rims.tops(normal, planes)
+    tops = rims.tops(*floor)
     if len(tops) == 0:
         return
-    for index, view in enumerate(views):
+    for index, (view, z) in enumerate(zip(views, depths, strict=True)):
         even = even_patches(view.picture, shelved_patches(view, index, patches))
-        depths[index] = laid_on_tops(view, depths[index], tops, even)
+        laid = laid_on_tops(view, z, tops, even)
+        filled[index] = np.where(laid != z, laid, filled[index])
         on_share(0.5 + 0.5 * (index + 1) / len(views))

@@ -32,6 +32,10 @@ ON_PLANE, _ALIGNED = 0.01, 0.9
 """How near a point is to its plane, relative to its depth; |cosine| between their normals."""
 _MOST_PLANES, _HYPOTHESES, _LEAST_SHARE = 24, 300, 0.01
 _MIN_KNOWN, _MIN_SHARE = 30, 0.5
+LEVEL = 0.8
+"""A plane is about level from this cosine between its normal and up on."""
+_BELOW, _MOST_BELOW = 0.03, 0.02
+"""Of known points, so many may seem to lie below a floor by so much of their depth."""
 _EXTRAPOLATED = 3.0
 """How much nearer or farther than all its known pixels a patch may reach."""
 
@@ -79,6 +83,32 @@ def planes_and_samples(
         rest = ~_on_plane(plane, points, normals, depths, slack=2.0)
         points, normals, depths = points[rest], normals[rest], depths[rest]
     return np.array(planes).reshape(-1, 4), every[0], every[2]
+
+
+def levels_of(views: Sequence[StereoView], planes: Floats) -> Floats:
+    """[P], the cosine between each plane's n and up: 1 or -1 of a level one.
+
+    Which way is up: as the pictures have it in the mean.
+    """
+    up = np.mean([-view.world_from_camera[:, 1] for view in views], axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    cosines: Floats = planes[:, :3] @ up
+    return cosines
+
+
+def floors_of(
+    views: Sequence[StereoView], planes: Floats, points: Floats, depths: Floats
+) -> list[int]:
+    """Numbers of the planes that are about level, and below which nothing is known.
+
+    points: [K, 3], with their depths [K].
+    """
+    found = []
+    for number, (plane, level) in enumerate(zip(planes, levels_of(views, planes), strict=True)):
+        height = (points @ plane[:3] - plane[3]) * np.sign(level)
+        if abs(level) >= LEVEL and (height < -_BELOW * depths).mean() <= _MOST_BELOW:
+            found.append(number)
+    return found
 
 
 def laid_on_planes(view: StereoView, z: Depths, planes: Floats, patches: Labels) -> Depths:

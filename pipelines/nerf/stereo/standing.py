@@ -30,13 +30,16 @@ from pipelines.nerf.stereo.maps import MapShelf, Progress, depths_of, surface_po
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.patches import Labels, even_patches
 from pipelines.nerf.stereo.planes import (
+    LEVEL,
     ON_PLANE,
     Floats,
+    floors_of,
     inverse_depths,
+    levels_of,
     planes_and_samples,
     ray_grid,
 )
-from pipelines.nerf.stereo.shelves import MEMORY, Shelf, Shelves
+from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
 from pipelines.nerf.stereo.spreading import (
     MOST_KNOWN,
     PlainPatches,
@@ -56,15 +59,17 @@ _LEAST_INSIDE = 0.5
 """What is thinner is an edge that is not sharp, neither here nor there."""
 _REACH_PX = 5
 """Matching takes squares, so depths next to an edge are not to be had, or are the other side's."""
-_LEVEL = 0.8
-_BELOW, _MOST_BELOW = 0.03, 0.02
-"""Of known points, so many may seem to lie below a floor by so much of their depth."""
-_MOST_LINES, _HYPOTHESES, _MOST_ENDS = 12, 400, 20_000
+_UPRIGHT = 0.1
+"""Cosine, up to which planes stand."""
+_MOST_LINES, _HYPOTHESES, _MOST_ENDS = 12, 2000, 20_000
 _LEAST_PX, _LEAST_VIEWS, _LEAST_VIEW_PX, _MOST_VIEW_PX = 60, 3, 8, 60
 _LEAST_LENGTH = 0.03
 """Of a line between two points that stand for one, relative to their depth."""
 _LEAST_SPREAD_DEG = 1.0
 _BEHIND = 0.02
+_BEYOND, _MOST_BEYOND, _MOST_PLACES = 0.06, 0.2, 200
+"""No more of the floor so far beyond a wall's foot, by its depth, may be known, of what views could
+see of it."""
 _SAME_DEG = 4.0
 _TOUCH_PX, _TOUCH_SHARE, _MOST_TOUCHED = 12, 0.12, 3
 _BENEATH_WEIGHT = 0.5
@@ -90,10 +95,14 @@ class _Look(PlainPatches):
 
 @dataclass(frozen=True)
 class _Wall:
-    """An upright plane [4], and the number of the floor that it stands on."""
+    """An upright plane [4], the number of the floor that it stands on, and some places [K, 3] where
+    that ends, with their depths [K] in the views that show it.
+    """
 
     plane: Floats
     floor: int
+    places: Floats
+    depths: Floats
 
 
 def stood_up(
@@ -114,7 +123,8 @@ def stood_up(
     planes, points, depths = planes_and_samples(
         views, maps, lambda done: on_progress(_PLANES_SHARE * done, _MESSAGE)
     )
-    floors = _floors(views, planes, points, depths)
+    planes = planes[_is_level_or_upright(levels_of(views, planes))]
+    floors = floors_of(views, planes, points, depths)
     if not floors:
         return maps
     looks = []
@@ -124,6 +134,7 @@ def stood_up(
         share = (_LOOK_SHARE - _PLANES_SHARE) * (index + 1) / len(views)
         on_progress(_PLANES_SHARE + share, _MESSAGE)
     walls = _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
+    walls = [wall for wall in walls if not _goes_on(views, depths_of(maps), wall)]
     if not walls:
         return maps
     every, stands_on = _with_walls(planes, walls, float(np.median(depths)))
@@ -157,22 +168,12 @@ def stood_up(
     )
 
 
-def _floors(
-    views: Sequence[StereoView], planes: Floats, points: Floats, depths: Floats
-) -> list[int]:
-    """Numbers of the planes that are about level, and below which nothing is known.
-
-    Which way is up: as the pictures have it in the mean. points: [K, 3], with their depths [K].
+def _is_level_or_upright(levels: Floats) -> Bools:
+    """[P]: of planes with those cosines to up, what a plain patch may be laid on by its border
+    alone. A small surface gives a plane of no use, aslant as a rule, and somewhere it is touched.
     """
-    up = np.mean([-view.world_from_camera[:, 1] for view in views], axis=0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
-    found = []
-    for number, plane in enumerate(planes):
-        level = float(plane[:3] @ up)
-        height = (points @ plane[:3] - plane[3]) * np.sign(level)
-        if abs(level) >= _LEVEL and (height < -_BELOW * depths).mean() <= _MOST_BELOW:
-            found.append(number)
-    return found
+    steep: Bools = (np.abs(levels) >= LEVEL) | (np.abs(levels) <= _UPRIGHT)
+    return steep
 
 
 def _look(view: StereoView, z: Depths, planes: Floats, patches: Labels) -> _Look:
@@ -250,7 +251,8 @@ def _find_walls(
                 and _spread_deg(centers[seen_by] - point, direction) >= _LEAST_SPREAD_DEG
                 and _share_behind(centers, plane) <= _BEHIND
             ):
-                walls.append(_Wall(plane, floor))
+                some = np.flatnonzero(on_it)[:: max(1, int(on_it.sum()) // _MOST_PLACES)]
+                walls.append(_Wall(plane, floor, places[some], depths[some]))
             left = away >= 2.0 * ON_PLANE * depths
             flat, depths, views, pieces = flat[left], depths[left], views[left], pieces[left]
             places = places[left]
@@ -329,6 +331,29 @@ def _share_behind(centers: Floats, plane: Floats) -> float:
     """How many of the cameras are on the side of a wall where fewer are, [0, 0.5]."""
     before = float((centers @ plane[:3] > plane[3]).mean())
     return min(before, 1.0 - before)
+
+
+def _goes_on(views: Sequence[StereoView], depths: ByView[Depths], wall: _Wall) -> bool:
+    """Whether views know the floor beyond a wall's foot: then something merely hid it from others.
+
+    depths: the views' maps.
+    """
+    centers = np.stack([view.center for view in views])
+    away = -np.sign(np.median(centers @ wall.plane[:3] - wall.plane[3]))
+    beyond = wall.places + away * _BEYOND * wall.depths[:, None] * wall.plane[:3]
+    num_seen = num_floor = 0
+    for view, depth in zip(views, depths, strict=True):
+        local = (beyond - view.center) @ view.world_from_camera[:, :3]
+        ahead = local[:, 2] > 1e-9
+        z = np.where(ahead, local[:, 2], 1.0)
+        fx, fy, cx, cy = view.lens
+        u, v = fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy
+        height, width = depth.shape
+        ahead &= (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        known = depth[np.where(ahead, v, 0).astype(int), np.where(ahead, u, 0).astype(int)]
+        num_seen += int(ahead.sum())
+        num_floor += int((ahead & (np.abs(known / z - 1.0) < 2.0 * ON_PLANE)).sum())
+    return num_floor > _MOST_BEYOND * num_seen
 
 
 def _with_walls(planes: Floats, walls: Sequence[_Wall], depth: float) -> tuple[Floats, list[int]]:

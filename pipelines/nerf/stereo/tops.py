@@ -23,19 +23,30 @@ from skimage.morphology import convex_hull_image
 from skimage.segmentation import expand_labels
 
 from pipelines.nerf.stereo.patches import Labels
-from pipelines.nerf.stereo.planes import ON_PLANE, Depths, Floats, fitted, inverse_depths, ray_grid
+from pipelines.nerf.stereo.planes import (
+    LEVEL,
+    ON_PLANE,
+    Depths,
+    Floats,
+    fitted,
+    inverse_depths,
+    levels_of,
+    ray_grid,
+)
 from pipelines.nerf.stereo.views import StereoView
 
 Bools = NDArray[np.bool_]
 
-_LEVEL = 0.8
-_LEAST_AREA, _MOST_KNOWN, _LEAST_KNOWN, _LEAST_ON = 0.01, 0.5, 30, 0.5
+_LEAST_AREA, _MOST_KNOWN, _LEAST_KNOWN, _LEAST_ON = 0.01, 0.8, 30, 0.5
 """A patch counts if it is so large, of the picture, no more than half of it is known, but so many
 pixels are; it lies at a height if so many of these do."""
+_LEAST_ROUND = 0.5
+"""Of a patch, so much lies between what is known of it at that height: a rim goes round a top, and
+does not only pass by it below."""
 _LEAST_VIEWS, _LEAST_VIEW_SHARE, _MOST_TOPS = 3, 0.05, 4
 _STEPS_PER_DEPTH = 400
 """Heights tried, per median depth."""
-_MOST_TILT_DEG = 3.0
+_MOST_TILT_DEG, _CLEARLY_MORE = 3.0, 1.1
 _APART = 4.0 * ON_PLANE
 """Planes nearer to each other than this, by the depth, are one."""
 _FATTENED_PX = 8
@@ -45,9 +56,12 @@ border may have the depth that is beyond it."""
 
 @dataclass(frozen=True)
 class _Rim:
-    """What is known of a plain patch: points [K, 3], world, and their depths [K]; of which view."""
+    """What is known of a plain patch: points [K, 3], world, and their depths [K]; of which view,
+    and that camera's place [3].
+    """
 
     view: int
+    eye: Floats
     points: Floats
     depths: Floats
 
@@ -67,16 +81,17 @@ class Rims:
             depth = z[row, column].astype(np.float64)
             local = np.stack([x[column] * depth, y[row, 0] * depth, depth], axis=-1)
             points = local @ view.world_from_camera[:, :3].T + view.center
-            self._rims.append(_Rim(self._num_views, points, depth))
+            self._rims.append(_Rim(self._num_views, view.center, points, depth))
         self._num_views += 1
 
-    def tops(self, normal: Floats, planes: Floats) -> Floats:
-        """The planes [T, 4] about at right angles to `normal` that plain patches lie on by what is
-        known of them, the one of most patches first, without those that `planes` [P, 4] has.
+    def tops(self, normal: Floats, floors: Floats) -> Floats:
+        """The planes [T, 4] about at right angles to `normal`, upwards, that plain patches lie on
+        by what is known of them, the one of most views first.
+
+        floors: planes [P, 4] that are none: what is plain and stands on a floor has it for a rim.
         """
-        left, found = list(self._rims), [np.zeros((0, 4))]
-        level = planes[np.abs(planes[:, :3] @ normal) > np.cos(np.radians(_MOST_TILT_DEG))]
-        level = level * np.sign(level[:, :3] @ normal)[:, None]
+        left, found = list(self._rims), np.zeros((0, 4))
+        floors = floors * np.sign(floors[:, :3] @ normal)[:, None]
         for _ in range(_MOST_TOPS):
             height = self._best_height(left, normal)
             if height is None:
@@ -85,15 +100,15 @@ class Rims:
             if not members:
                 break
             left = [rim for rim in left if not any(rim is member for member in members)]
-            plane = _fitted_to(members, np.append(normal, height))
             points = np.concatenate([rim.points for rim in members])
             depths = np.concatenate([rim.depths for rim in members])
-            at = np.abs(points @ plane[:3] - plane[3]) < ON_PLANE * depths
-            apart = np.abs(points[at] @ level[:, :3].T - level[:, 3]) / depths[at, None]
+            plane = _fitted_to(points, depths, np.append(normal, height))
+            own = _on(plane, points, depths)
+            known = np.concatenate([floors, found])
+            apart = np.abs(points[own] @ known[:, :3].T - known[:, 3]) / depths[own, None]
             if not (np.median(apart, axis=0) < _APART).any():
-                found.append(plane[None])
-                level = np.concatenate([level, plane[None]])
-        return np.concatenate(found)
+                found = np.concatenate([found, plane[None]])
+        return found
 
     def _best_height(self, rims: Sequence[_Rim], normal: Floats) -> float | None:
         """That at which most patches lie, if they are of enough views."""
@@ -110,7 +125,8 @@ class Rims:
             begin = np.clip(np.ceil((height - reach - low) / step), 0, num - 1).astype(int)
             end = np.clip(np.floor((height + reach - low) / step) + 1, 0, num - 1).astype(int)
             count = np.bincount(begin, minlength=num) - np.bincount(end, minlength=num)
-            at_views[rim.view] |= np.cumsum(count) >= _LEAST_ON * len(height)
+            below = np.arange(num) * step + low < rim.eye @ normal
+            at_views[rim.view] |= below & (np.cumsum(count) >= _LEAST_ON * len(height))
         num_views = at_views.sum(axis=0)
         most = int(num_views.max())
         if most < max(_LEAST_VIEWS, _LEAST_VIEW_SHARE * self._num_views):
@@ -126,30 +142,27 @@ def _middle_of_longest_run(numbers: NDArray[np.int64]) -> float:
 
 
 def upwards(views: Sequence[StereoView], planes: Floats) -> Floats | None:
-    """The normal [3], upwards, of the first of the planes that is about level, if any.
-
-    Which way is up: as the pictures have it in the mean.
-    """
-    up = np.mean([-view.world_from_camera[:, 1] for view in views], axis=0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
-    level = planes[:, :3] @ up
-    flat = np.flatnonzero(np.abs(level) >= _LEVEL)
+    """The normal [3], upwards, of the first of the planes [P, 4] that is about level, if any."""
+    levels = levels_of(views, planes)
+    flat = np.flatnonzero(np.abs(levels) >= LEVEL)
     if not len(flat):
         return None
-    normal: Floats = planes[flat[0], :3] * np.sign(level[flat[0]])
+    normal: Floats = planes[flat[0], :3] * np.sign(levels[flat[0]])
     return normal
 
 
 def laid_on_tops(view: StereoView, z: Depths, tops: Floats, patches: Labels) -> Depths:
-    """A depth map [H, W] with its plain patches on those of the tops [T, 4] that half of what is
-    known of them lies on, between these pixels.
+    """A depth map [H, W] with its plain patches on those of the tops [T, 4], below the camera, that
+    half of what is known of them lies on, between these pixels.
 
-    Where the depth is that of what lies beyond the patch's border, close by, it is not the patch's.
+    Known pixels stay where they are before the top, as a cup would be, but not where the depth is
+    that of what lies beyond the patch's border, close by. Nothing is seen through a top.
     """
     laid = z.copy()
     hull_of: Any = convex_hull_image
     inverses = inverse_depths(view, tops, *ray_grid(view))
     off = np.stack([np.abs(_heights(view, z, top)) for top in tops])
+    off[tops[:, :3] @ view.center <= tops[:, 3]] = np.inf
     for patch in _open_patches(z, patches):
         own = patches == patch
         near = own & (z > 0) & (off < 2.0 * ON_PLANE * z)
@@ -157,8 +170,12 @@ def laid_on_tops(view: StereoView, z: Depths, tops: Floats, patches: Labels) -> 
         if near[best].sum() < _LEAST_ON * (own & (z > 0)).sum():
             continue
         inverse = inverses[best]
-        within = own & hull_of(near[best]) & (inverse > 1e-9) & (view.picture >= 0.0)
-        within &= (z == 0) | near[best] | _carried_in(z, own)
+        within = own & hull_of(near[best])
+        if within.sum() < _LEAST_ROUND * own.sum():
+            continue
+        within &= (inverse > 1e-9) & (view.picture >= 0.0)
+        is_behind = z * inverse > 1.0
+        within &= (z == 0) | near[best] | is_behind | _carried_in(z, own)
         laid[within] = (1.0 / inverse[within]).astype(np.float32)
     return laid
 
@@ -194,18 +211,25 @@ def _share_at(rim: _Rim, normal: Floats, height: float) -> float:
     return float((np.abs(rim.points @ normal - height) <= 2.0 * ON_PLANE * rim.depths).mean())
 
 
-def _fitted_to(rims: Sequence[_Rim], level: Floats) -> Floats:
-    """The plane [4] of what the patches' known points agree on, near the level one."""
-    points = np.concatenate([rim.points for rim in rims])
-    depths = np.concatenate([rim.depths for rim in rims])
+def _fitted_to(points: Floats, depths: Floats, level: Floats) -> Floats:
+    """The plane [4] near `level` that most of the points lie on: level too, unless one that is
+    tilted a little has clearly more of them.
+    """
+    at = _on(level, points, depths)
+    if at.any():
+        level = np.append(level[:3], np.median((points @ level[:3])[at]))
     plane = level
     for _ in range(5):
-        at = np.abs(points @ plane[:3] - plane[3]) < ON_PLANE * depths
+        at = _on(plane, points, depths)
         if at.sum() < _LEAST_KNOWN:
             return level
         plane = fitted(points[at], 1.0 / depths[at])
         plane = plane * np.sign(plane[:3] @ level[:3])
-        if plane[:3] @ level[:3] < np.cos(np.radians(_MOST_TILT_DEG)):
-            heights = np.median((points @ level[:3])[at])
-            return np.append(level[:3], heights)
-    return plane
+    is_near = plane[:3] @ level[:3] > np.cos(np.radians(_MOST_TILT_DEG))
+    more = _on(plane, points, depths).sum() > _CLEARLY_MORE * _on(level, points, depths).sum()
+    return plane if is_near and more else level
+
+
+def _on(plane: Floats, points: Floats, depths: Floats) -> Bools:
+    on: Bools = np.abs(points @ plane[:3] - plane[3]) < ON_PLANE * depths
+    return on

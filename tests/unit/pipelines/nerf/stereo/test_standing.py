@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
-from pipelines.nerf.stereo.standing import stood_up
+from pipelines.nerf.stereo.standing import _is_level_or_upright, stood_up
 from tests.unit.pipelines.nerf.stereo.blank_room import WALL, Seen, look, walk
 
 CONFIG = StereoConfig(num_neighbours=5)
@@ -158,3 +158,9 @@ def test_what_seems_to_stand_before_a_plain_wall_goes_back_onto_it() -> None:
     # Something farther is a way through, and stays.
     maps[3] = with_known(seen[3], halo, 1.3)
     assert np.array_equal(stood(seen, maps)[3].z[halo], maps[3].z[halo])
+
+
+def test_nothing_is_laid_aslant_by_its_border_alone() -> None:
+    """Planes of small surfaces, 8 degrees off upright, are touched by some border, too."""
+    assert _is_level_or_upright(np.array([1.0, -0.99, 0.85, 0.0, -0.08])).all()
+    assert not _is_level_or_upright(np.array([0.139, -0.5, 0.7])).any()

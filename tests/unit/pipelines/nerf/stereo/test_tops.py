@@ -10,7 +10,7 @@ from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
 from pipelines.nerf.stereo.patches import even_patches
-from pipelines.nerf.stereo.planes import find_planes
+from pipelines.nerf.stereo.planes import floors_of, planes_and_samples
 from pipelines.nerf.stereo.tops import Rims, laid_on_tops, upwards
 from tests.unit.pipelines.nerf.stereo.white_table import (
     FLOOR,
@@ -66,19 +66,32 @@ def _off(one: Seen, found: DepthMap) -> float:
 def test_the_height_is_found_from_the_rim() -> None:
     seen = walk_round()
     views, maps = [one.view for one in seen], [one.known() for one in seen]
-    planes = find_planes(views, maps)
+    planes, points, depths = planes_and_samples(views, maps)
     assert np.abs(np.abs(planes @ [0.0, 1.0, 0.0, 0.0]) * np.abs(planes[:, 3]) - TOP).min() > 0.1
+    (floor,) = floors_of(views, planes, points, depths)
+    assert np.abs(np.abs(planes[floor]) - FLOOR_PLANE).max() < 0.01
     normal = upwards(views, planes)
     assert normal is not None
     assert normal @ UP > 0.999
-    (top,) = rims_of(seen).tops(normal, planes)
+    (top,) = rims_of(seen).tops(normal, FLOOR_PLANE)
     assert np.abs(top - [0.0, -1.0, 0.0, -TOP]).max() < 0.01
 
 
-def test_a_plane_that_is_known_is_no_top_again() -> None:
-    known = np.vstack([FLOOR_PLANE, [0.0, 1.0, 0.0, TOP * 1.01]])
-    assert len(rims_of(walk_round()).tops(UP, known)) == 0
-    assert len(rims_of(walk_round()).tops(UP, FLOOR_PLANE)) == 1
+def test_a_floor_is_no_top() -> None:
+    floor = np.array([[0.0, -1.0, 0.0, -TOP * 1.01]])
+    assert len(rims_of(walk_round()).tops(UP, floor)) == 0
+    assert len(rims_of(walk_round()).tops(UP, -floor)) == 0
+    assert len(rims_of(walk_round()).tops(UP, np.zeros((0, 4)))) == 1
+
+
+def test_what_is_above_the_camera_is_no_top() -> None:
+    """The same rims turned over: a ceiling's."""
+    seen = walk_round()
+    assert len(rims_of(seen).tops(-UP, np.zeros((0, 4)))) == 0
+    for one in seen:
+        under = np.array([[0.0, 1.0, 0.0, TOP]])
+        laid = laid_on_tops(one.view, one.known().z, under, even_patches(one.view.picture))
+        assert (laid == one.known().z).all()
 
 
 def test_two_tables_of_different_heights_are_two_tops() -> None:
