@@ -40,6 +40,8 @@ Bools = NDArray[np.bool_]
 _LEAST_AREA, _MOST_KNOWN, _LEAST_KNOWN, _LEAST_ON = 0.01, 0.8, 30, 0.5
 """A patch counts if it is so large, of the picture, no more than half of it is known, but so many
 pixels are; it lies at a height if so many of these do."""
+_MOST_POINTS = 400
+"""Of a patch, for the height."""
 _LEAST_ROUND = 0.5
 """Of a patch, so much lies between what is known of it at that height: a rim goes round a top, and
 does not only pass by it below."""
@@ -56,8 +58,8 @@ border may have the depth that is beyond it."""
 
 @dataclass(frozen=True)
 class _Rim:
-    """What is known of a plain patch: points [K, 3], world, and their depths [K]; of which view,
-    and that camera's place [3].
+    """Some of what is known of a plain patch: points [K, 3], world, with their depths [K]; of which
+    view, and that camera's place [3].
     """
 
     view: int
@@ -77,7 +79,9 @@ class Rims:
         """The next view's. patches: [H, W], of its picture."""
         x, y = ray_grid(view)
         for patch in _open_patches(z, patches):
-            row, column = np.nonzero((patches == patch) & (z > 0))
+            known = np.flatnonzero((patches == patch) & (z > 0))
+            some = known[np.linspace(0, len(known) - 1, min(len(known), _MOST_POINTS)).astype(int)]
+            row, column = np.unravel_index(some, z.shape)
             depth = z[row, column].astype(np.float64)
             local = np.stack([x[column] * depth, y[row, 0] * depth, depth], axis=-1)
             points = local @ view.world_from_camera[:, :3].T + view.center
