@@ -48,7 +48,7 @@ does not only pass by it below."""
 _LEAST_VIEWS, _LEAST_VIEW_SHARE, _MOST_TOPS = 3, 0.05, 4
 _STEPS_PER_DEPTH = 400
 """Heights tried, per median depth."""
-_MOST_TILT_DEG, _CLEARLY_MORE = 3.0, 1.1
+_MOST_TILT_DEG = 3.0
 _APART = 4.0 * ON_PLANE
 """Planes nearer to each other than this, by the depth, are one."""
 _FATTENED_PX = 8
@@ -216,22 +216,24 @@ def _share_at(rim: _Rim, normal: Floats, height: float) -> float:
 
 
 def _fitted_to(points: Floats, depths: Floats, level: Floats) -> Floats:
-    """The plane [4] near `level` that most of the points lie on: level too, unless one that is
-    tilted a little has clearly more of them.
+    """The plane [4] near `level` that most of the points lie on, half as tilted as they have it.
+
+    A rim is carried inwards, so that of a top seen from one side the near part seems to be higher
+    and the far part lower; and what is level in a capture is known to a degree only.
     """
-    at = _on(level, points, depths)
-    if at.any():
-        level = np.append(level[:3], np.median((points @ level[:3])[at]))
-    plane = level
+    tilted = level
     for _ in range(5):
-        at = _on(plane, points, depths)
+        at = _on(tilted, points, depths)
         if at.sum() < _LEAST_KNOWN:
-            return level
-        plane = fitted(points[at], 1.0 / depths[at])
-        plane = plane * np.sign(plane[:3] @ level[:3])
-    is_near = plane[:3] @ level[:3] > np.cos(np.radians(_MOST_TILT_DEG))
-    more = _on(plane, points, depths).sum() > _CLEARLY_MORE * _on(level, points, depths).sum()
-    return plane if is_near and more else level
+            break
+        tilted = fitted(points[at], 1.0 / depths[at])
+        tilted = tilted * np.sign(tilted[:3] @ level[:3])
+    if tilted[:3] @ level[:3] < np.cos(np.radians(_MOST_TILT_DEG)):
+        tilted = level
+    normal = tilted[:3] + level[:3]
+    normal /= np.linalg.norm(normal)
+    at = _on(tilted, points, depths)
+    return np.append(normal, np.median((points @ normal)[at])) if at.any() else level
 
 
 def _on(plane: Floats, points: Floats, depths: Floats) -> Bools:
