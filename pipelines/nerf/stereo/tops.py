@@ -38,8 +38,8 @@ from pipelines.nerf.stereo.views import StereoView
 Bools = NDArray[np.bool_]
 
 _LEAST_AREA, _MOST_KNOWN, _LEAST_KNOWN, _LEAST_ON = 0.01, 0.8, 30, 0.5
-"""A patch counts if it is so large, of the picture, no more than half of it is known, but so many
-pixels are; it lies at a height if so many of these do."""
+"""A patch counts if it is so large, of the picture, less than that of it is known, as then it has
+texture, but so many pixels are; it lies at a height if that share of these does."""
 _MOST_POINTS = 400
 """Of a patch, for the height."""
 _LEAST_ROUND = 0.5
