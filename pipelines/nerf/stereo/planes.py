@@ -40,15 +40,6 @@ _EXTRAPOLATED = 3.0
 """How much nearer or farther than all its known pixels a patch may reach."""
 
 
-def find_planes(
-    views: Sequence[StereoView],
-    maps: ByView[DepthMap],
-    on_progress: Callable[[float], None] = lambda fraction: None,
-) -> Floats:
-    """The planes [P, 4] (n, d) that most of the known surfaces lie on; see `planes_and_samples`."""
-    return planes_and_samples(views, maps, on_progress)[0]
-
-
 def planes_and_samples(
     views: Sequence[StereoView],
     maps: ByView[DepthMap],

@@ -343,16 +343,9 @@ def _goes_on(views: Sequence[StereoView], depths: ByView[Depths], wall: _Wall) -
     beyond = wall.places + away * _BEYOND * wall.depths[:, None] * wall.plane[:3]
     num_seen = num_floor = 0
     for view, depth in zip(views, depths, strict=True):
-        local = (beyond - view.center) @ view.world_from_camera[:, :3]
-        ahead = local[:, 2] > 1e-9
-        z = np.where(ahead, local[:, 2], 1.0)
-        fx, fy, cx, cy = view.lens
-        u, v = fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy
-        height, width = depth.shape
-        ahead &= (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        known = depth[np.where(ahead, v, 0).astype(int), np.where(ahead, u, 0).astype(int)]
-        num_seen += int(ahead.sum())
-        num_floor += int((ahead & (np.abs(known / z - 1.0) < 2.0 * ON_PLANE)).sum())
+        z, row, column = view.seen_at(beyond)
+        num_seen += len(z)
+        num_floor += int((np.abs(depth[row, column] / z - 1.0) < 2.0 * ON_PLANE).sum())
     return num_floor > _MOST_BEYOND * num_seen
 
 

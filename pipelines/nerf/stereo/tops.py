@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from skimage.morphology import convex_hull_image
 from skimage.segmentation import expand_labels
 
+from pipelines.nerf.stereo.maps import back_project
 from pipelines.nerf.stereo.patches import Labels
 from pipelines.nerf.stereo.planes import (
     LEVEL,
@@ -77,15 +78,15 @@ class Rims:
 
     def add(self, view: StereoView, z: Depths, patches: Labels) -> None:
         """The next view's. patches: [H, W], of its picture."""
-        x, y = ray_grid(view)
         for patch in _open_patches(z, patches):
             known = np.flatnonzero((patches == patch) & (z > 0))
             some = known[np.linspace(0, len(known) - 1, min(len(known), _MOST_POINTS)).astype(int)]
-            row, column = np.unravel_index(some, z.shape)
-            depth = z[row, column].astype(np.float64)
-            local = np.stack([x[column] * depth, y[row, 0] * depth, depth], axis=-1)
-            points = local @ view.world_from_camera[:, :3].T + view.center
-            self._rims.append(_Rim(self._num_views, view.center, points, depth))
+            chosen = np.zeros_like(z)
+            chosen.flat[some] = z.flat[some]
+            depths = z.flat[some].astype(np.float64)
+            self._rims.append(
+                _Rim(self._num_views, view.center, back_project(view, chosen), depths)
+            )
         self._num_views += 1
 
     def tops(self, normal: Floats, floors: Floats) -> Floats:

@@ -58,13 +58,23 @@ class StereoView:
 
     def seen(self, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Depths [P] of world points [P, 3], and which of them the picture shows."""
+        z, _, _, shown = self._projected(points)
+        return z, shown
+
+    def seen_at(self, points: Floats) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
+        """Depths, rows and columns, [S] each, of the world points [P, 3] that the picture shows."""
+        z, u, v, shown = self._projected(points)
+        return z[shown], v[shown].astype(np.int64), u[shown].astype(np.int64)
+
+    def _projected(self, points: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+        """z, u and v [P] of world points [P, 3], and which of them the picture shows."""
         local = (points - self.center) @ self.world_from_camera[:, :3]
         z = local[:, 2]
         safe = np.where(z > 0, z, np.inf)
         fx, fy, cx, cy = self.lens
         u, v = fx * local[:, 0] / safe + cx, fy * local[:, 1] / safe + cy
         height, width = self.picture.shape
-        return z, (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        return z, u, v, (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
 
     def reduced(self, factor: int) -> StereoView:
         """The view at 1 / factor of its size; squares that are not whole have no picture."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
-from pipelines.nerf.stereo.planes import find_planes
+from pipelines.nerf.stereo.planes import planes_and_samples
 from pipelines.nerf.stereo.views import StereoView
 from tests.unit.pipelines.nerf.stereo.painted_wall import BOX, SLOPE, WALL, row_of_cameras
 
@@ -50,7 +50,7 @@ def maps_without(depths: list[np.ndarray], unknown: list[Mask]) -> list[DepthMap
 
 def test_planes_of_the_scene_are_found_largest_first() -> None:
     views, depths, middles = blank_wall()
-    planes = find_planes(views, maps_without(depths, middles))
+    planes = planes_and_samples(views, maps_without(depths, middles))[0]
     planes *= np.sign(planes[:, 2:3])
     assert np.abs(planes[0] - WALL_PLANE).max() < 2e-3
     assert np.abs(planes[1] - [0.0, 0.0, 1.0, BOX]).max() < 5e-3
