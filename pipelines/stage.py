@@ -123,6 +123,10 @@ class StageContext:
         self.check_cancelled()
         self.on_progress(min(max(fraction, 0.0), 1.0), message, eta_s)
 
+    def told_part(self, message: str, begin: float, end: float) -> Callable[[float], None]:
+        """What reports the share that is done of a part, which goes from `begin` to `end`."""
+        return lambda done: self.progress(begin + (end - begin) * done, message)
+
     def check_cancelled(self) -> None:
         """Raise `Cancelled` once the job's cancel was asked for."""
         if self.is_cancelled():

@@ -10,8 +10,8 @@ import importlib
 from pipelines.exports.export import Export
 
 KINDS = (
-    "pointcloud",
     "mesh",
+    "pointcloud",
     "video",
     "cameras",
     "dataset",

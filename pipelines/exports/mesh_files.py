@@ -17,7 +17,7 @@ from pipelines.exports.judged import JUDGED_MESH
 from pipelines.exports.levels import levels_of, texture_px_of
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.mesh_options import Format, MeshOptions
-from pipelines.exports.mesh_shape import REDUCE_SHARE, Part, told_part
+from pipelines.exports.mesh_shape import REDUCE_SHARE, Part
 from pipelines.exports.placement import Placement
 from pipelines.exports.subject import Thing
 from pipelines.exports.subject_files import save_subject
@@ -107,7 +107,7 @@ def write_mesh(
     ctx: StageContext,
 ) -> None:
     """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
-    told = told_part(ctx, "writing", _TEXTURE_SHARE, _SUBJECT_SHARE)
+    told = ctx.told_part("writing", _TEXTURE_SHARE, _SUBJECT_SHARE)
     told(0.0)
     frame = place.frame(options.up_axis)
     mesh, skin = place.mesh(mesh), place.mesh(skin)
@@ -134,7 +134,7 @@ def write_subject(
     ctx: StageContext,
 ) -> dict[str, Any]:
     """Write the thing that was walked round beside the mesh; what is told of it."""
-    told = told_part(ctx, "cutting out the subject", _SUBJECT_SHARE, 1.0)
+    told = ctx.told_part("cutting out the subject", _SUBJECT_SHARE, 1.0)
     told(0.0)
     shown = scene.training_images()
     return save_subject(

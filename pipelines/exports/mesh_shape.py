@@ -147,7 +147,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
             (SEARCH_SHARE, _RENDER_SHARE),
             plan.known,
         )
-        told = told_part(ctx, "looking for surfaces", _RENDER_SHARE, _AFFORD_SHARE)
+        told = ctx.told_part("looking for surfaces", _RENDER_SHARE, _AFFORD_SHARE)
         shells = affordable(store, plan.shells, told)
         coarser = _coarser(plan.shells, shells)
         if coarser is not None:
@@ -159,7 +159,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
             )
         if options.refine == "photos":
             mesh = _on_the_photos(mesh, scene, shells, options, ctx)
-        told = told_part(ctx, "closing holes", _MEND_SHARE, _CLOSED_SHARE)
+        told = ctx.told_part("closing holes", _MEND_SHARE, _CLOSED_SHARE)
         limits = hole_limits(shells, options.close_holes, options.max_distance)
         closing = close_holes(mesh, limits, store, told)
     mesh = closing.mesh
@@ -177,7 +177,7 @@ def _fused(
     ctx: StageContext,
 ) -> tuple[TriangleMesh, Method]:
     """All shells as one mesh, and the method that made it."""
-    told = told_part(ctx, "fusing depth", _AFFORD_SHARE, _FUSE_SHARE)
+    told = ctx.told_part("fusing depth", _AFFORD_SHARE, _FUSE_SHARE)
     faces = options.max_faces
     try:
         mesh = fuse_shells(store, shells, faces, told, method, scene.density, options.density_level)
@@ -198,7 +198,7 @@ def _on_the_photos(
     ctx: StageContext,
 ) -> TriangleMesh:
     """The mesh moved onto what the training photos agree on."""
-    told = told_part(ctx, "refining", _FUSE_SHARE, _MEND_SHARE)
+    told = ctx.told_part("refining", _FUSE_SHARE, _MEND_SHARE)
     return refined(
         mesh,
         _photos(stereo_view, scene, ctx, told),
@@ -210,7 +210,7 @@ def _on_the_photos(
 
 def _on_the_edges(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
     """The mesh with its outlines on the edges of the training photos."""
-    told = told_part(ctx, "moving outlines", _CLOSED_SHARE, _REFINE_SHARE)
+    told = ctx.told_part("moving outlines", _CLOSED_SHARE, _REFINE_SHARE)
     return outlined(mesh, _photos(color_view, scene, ctx, told), told)
 
 
@@ -264,7 +264,7 @@ def finished(part: Part, options: MeshOptions, ctx: StageContext) -> Part:
     mesh = part.mesh
     if options.triangles:
         words = f"reducing {len(mesh.faces)} triangles"
-        told = told_part(ctx, words, _REFINE_SHARE, REDUCE_SHARE)
+        told = ctx.told_part(words, _REFINE_SHARE, REDUCE_SHARE)
         told(0.0)
         mesh = reduced(mesh, options.triangles, told)
     if options.watertight:
@@ -273,11 +273,6 @@ def finished(part: Part, options: MeshOptions, ctx: StageContext) -> Part:
         if not is_closed(mesh.faces):
             ctx.logger.warning("The mesh is not watertight: %s", why_open(mesh.faces))
     return replace(part, mesh=mesh)
-
-
-def told_part(ctx: StageContext, message: str, begin: float, end: float) -> Callable[[float], None]:
-    """What tells the share that is done of a part of the export."""
-    return lambda done: ctx.progress(begin + (end - begin) * done, message, None)
 
 
 def _coarser(asked: Sequence[Shell], made: Sequence[Shell]) -> dict[str, Any] | None:

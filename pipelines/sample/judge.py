@@ -1,4 +1,4 @@
-"""How far poses and a mesh made from an analytic scene are from the truth.
+"""How far poses, a mesh and a cloud made from an analytic scene are from the truth.
 
 Poses are aligned to the true cameras by a similarity of the camera centres; the mesh is moved by
 that same similarity and nothing else, so a wrong scale or a tilt shows. Only what cameras saw
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pipelines.sample.align import Floats, path_extent, similarity
 from pipelines.sample.scene import (
@@ -182,19 +183,57 @@ def judge_surface(
 
     Arguments as of `judge_mesh`. A mesh without faces scores 0 with infinite distances.
     """
-    size, region = scene.subject.size, scene.subject
-    seen = seen_surface(truth, region, _RAYS_PER_POINT * num_points, scene)
-    true_points = _thinned(seen, 0.5 * TOLERANCES[0] * size)
+    true_points = _true_points(truth, scene, num_points)
     moved = alignment.apply_to_points(np.asarray(vertices, dtype=np.float64))
-    points, off = np.zeros((0, 3)), np.zeros(0)
+    points = np.zeros((0, 3))
     missing = np.full(len(true_points), np.inf)
     if len(faces):
-        counted = region.grown(scene.beyond)
+        counted = scene.subject.grown(scene.beyond)
         points = _points_on_mesh(moved, _reaching_into(counted, moved, faces), num_points)
         points = points[counted.contains(points)]
         points = points[_in_view(points, truth)]
-        off = surface_distance(points, scene)
         missing = _distance_to_mesh(true_points, moved, faces)
+    return _surface_scores(points, true_points, missing, scene)
+
+
+def judge_cloud(
+    points: Floats,
+    alignment: Similarity,
+    truth: CamerasFile,
+    scene: Scene = SAMPLE,
+    num_points: int = 40_000,
+) -> SurfaceScores:
+    """The same of a cloud: precision and accuracy are of its points as they are, not by area,
+    recall and completeness by the point that is nearest.
+
+    points: [P, 3], in the frame that `alignment` moves to the true world.
+    """
+    true_points = _true_points(truth, scene, num_points)
+    moved = alignment.apply_to_points(np.asarray(points, dtype=np.float64))
+    missing = np.full(len(true_points), np.inf)
+    if len(moved):
+        missing = np.asarray(cKDTree(moved).query(true_points)[0], np.float64)
+    kept = scene.subject.grown(scene.beyond).contains(moved)
+    kept[kept] = _in_view(moved[kept], truth)
+    counted = moved[kept]
+    if len(counted) > num_points:
+        chosen = np.random.default_rng(0).choice(len(counted), num_points, replace=False)
+        counted = counted[chosen]
+    return _surface_scores(counted, true_points, missing, scene)
+
+
+def _true_points(truth: CamerasFile, scene: Scene, num_points: int) -> Floats:
+    """The true surface that cameras saw, about evenly by area."""
+    seen = seen_surface(truth, scene.subject, _RAYS_PER_POINT * num_points, scene)
+    return _thinned(seen, 0.5 * TOLERANCES[0] * scene.subject.size)
+
+
+def _surface_scores(
+    points: Floats, true_points: Floats, missing: Floats, scene: Scene
+) -> SurfaceScores:
+    """Scores of points [N, 3]. true_points: [T, 3]. missing: [T], how far what is judged is."""
+    size = scene.subject.size
+    off = surface_distance(points, scene) if len(points) else np.zeros(0)
     things, true_things = scene.things.contains(points), scene.things.contains(true_points)
     precision, recall = _shares(off, size), _shares(missing, size)
     return SurfaceScores(

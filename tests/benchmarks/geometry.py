@@ -13,8 +13,9 @@ that is finished already, made from that one CAPTURE; a scene's film must have h
 `--long-side`.
 
 Exact scenes: precision, recall and F-score of the mesh at 1 and 2 % of the size of the scene, only
-where cameras saw (`pipelines.sample.judge`), how far normals of mesh and cloud are off, and depth
-at true cameras. Folders with depth: that at held-out views. All: what the job's report says of mesh
+where cameras saw (`pipelines.sample.judge`), the same of the cloud (the table: precision at 1 %,
+and the median error per mille of the size), how far normals of mesh and cloud are off, and depth at
+true cameras. Folders with depth: that at held-out views. All: what the job's report says of mesh
 and cloud against held-out photos.
 Pictures: `depth.png` (photo | truth | mesh | error: red too near, blue too far, black missing) and
 `turntable.png` (the draft above the mesh, each coloured and shaded).
@@ -42,7 +43,8 @@ from tests.benchmarks.scene_capture import scene_capture
 from tests.benchmarks.tables import markdown_table, number, write_json
 
 HEADER = (
-    "capture", "F 1 %", "F 2 %", "precision", "recall", "things", "mesh deg", "cloud deg",
+    "capture", "F 1 %", "F 2 %", "precision", "recall", "things", "cloud 1 %", "cloud off",
+    "mesh deg", "cloud deg",
     "depth right", "covered", "mesh dB", "with holes", "model dB", "inconsistency", "seconds",
 )  # fmt: skip
 
@@ -112,6 +114,15 @@ def run_capture(name: str, given: argparse.Namespace) -> dict[str, Any]:
     return judge(name, job, folder, given)
 
 
+def points_of(cloud: dict[str, Any] | None) -> list[str]:
+    """What the table tells of a cloud: precision of its points at 1 %, and their median error, per
+    mille of the scene's size.
+    """
+    if cloud is None:
+        return [number(None), number(None)]
+    return [number(cloud["precision"][0.01], 3), number(1e3 * cloud["accuracy"], 2)]
+
+
 def row_of(found: dict[str, Any]) -> list[str]:
     """A line of the table."""
     surface, depth = found.get("surface"), found.get("depth") or {}
@@ -132,6 +143,7 @@ def row_of(found: dict[str, Any]) -> list[str]:
         share("precision", 0.02),
         share("recall", 0.02),
         share("things_precision", 0.02),
+        *points_of(found.get("cloud")),
         angle("mesh"),
         angle("cloud"),
         number(depth.get("covered_and_within_5_percent"), 3),

@@ -25,7 +25,14 @@ from pipelines.judging.depth_scores import depth_scores, nearest
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.sample.align import Floats
-from pipelines.sample.judge import NormalScores, judge_normals, judge_poses, judge_surface
+from pipelines.sample.judge import (
+    NormalScores,
+    SurfaceScores,
+    judge_cloud,
+    judge_normals,
+    judge_poses,
+    judge_surface,
+)
 from pipelines.sample.scene import depth_image, pose_matrix, render
 from pipelines.sample.takes import Take
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
@@ -68,12 +75,11 @@ def judge_scene(job: Workspace, take: Take, truth: CamerasFile) -> tuple[dict[st
     mesh = read_ply(job.stage("mesh") / "mesh.ply")
     poses = judge_poses(cameras, truth)
     points = back_to_world(mesh.points, mesh.from_world)
-    cloud = cloud_of(job.stage("pointcloud"))
+    path = cloud_of(job.stage("pointcloud"))
+    cloud = read_ply(path) if path.is_file() else None
     normals = {
         "mesh": _judge_normals(mesh, poses.alignment, take, truth),
-        "cloud": _judge_normals(read_ply(cloud), poses.alignment, take, truth)
-        if cloud.is_file()
-        else None,
+        "cloud": cloud and _judge_normals(cloud, poses.alignment, take, truth),
     }
     surface = judge_surface(points, mesh.faces, poses.alignment, truth, take.scene)
     moved = poses.alignment.apply_to_points(points)
@@ -86,8 +92,16 @@ def judge_scene(job: Workspace, take: Take, truth: CamerasFile) -> tuple[dict[st
         },
         "surface": asdict(surface)
         | {"normals": {name: found and asdict(found) for name, found in normals.items()}},
+        "cloud": cloud and asdict(_judge_cloud(cloud, poses.alignment, take, truth)),
         "depth": depth_scores(compared.found, compared.truth),
     }, compared
+
+
+def _judge_cloud(
+    found: Ply, alignment: Similarity, take: Take, truth: CamerasFile
+) -> SurfaceScores:
+    points = back_to_world(found.points, found.from_world)
+    return judge_cloud(points, alignment, truth, take.scene)
 
 
 def _judge_normals(

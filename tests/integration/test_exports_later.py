@@ -20,8 +20,9 @@ from tests.unit.pipelines.stages import tiny_job
 pytestmark = [pytest.mark.services, pytest.mark.timeout(600)]
 
 WANTED: dict[str, dict[str, Any]] = {
-    "mesh": {"crop": {"shape": "auto"}},
+    # Before the mesh: the job had none, so its cloud does not lie on one.
     "pointcloud": {"extent": "subject", "formats": ["ply", "xyz"]},
+    "mesh": {"crop": {"shape": "auto"}},
     "cameras": {},
 }
 

@@ -28,12 +28,14 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
     from pipelines.exports.mesh_files import Painter, write_levels, write_mesh, write_subject
     from pipelines.exports.mesh_shape import finished, part_of, plan_of, surface_of
     from pipelines.exports.placement import placement_of
+    from pipelines.exports.surface.surface_file import save_surface
     from pipelines.exports.surface.watertight import is_closed
     from pipelines.exports.texture.told import skin_told
 
     place = placement_of(options.frame, scene.cameras)
     plan = plan_of(scene, options, place, ctx)
     surface = surface_of(scene, options, plan, ctx)
+    save_surface(ctx.out, surface.mesh, surface.shells)
     part = finished(part_of(options, plan, surface, ctx), options, ctx)
     paint = Painter(scene, options, ctx)
     # Without a texture to deliver there is none to be judged by either.
@@ -68,7 +70,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=18,
+    version=19,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

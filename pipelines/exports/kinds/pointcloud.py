@@ -1,9 +1,10 @@
 """The point cloud: points with colour and normals from the depth of training views.
 
-In one frame, the world of cameras.json unless another is asked for, in the formats asked for.
-Normals point to the cameras that saw the points. Views are spread over the capture and just large
-enough for the points wanted, so the work is known beforehand and an empty crop ends in an error
-instead of a search without end.
+Points near the job's mesh are laid on it, as all views and the photos have made that; where it has
+nothing they stay where their view has them. In one frame, the world of cameras.json unless another
+is asked for, in the formats asked for. Normals point to the cameras that saw the points. Views are
+spread over the capture and just large enough for the points wanted, so the work is known beforehand
+and an empty crop ends in an error instead of a search without end.
 """
 
 from __future__ import annotations
@@ -22,9 +23,6 @@ from pipelines.exports.options import CropOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from pipelines.exports.placement import Placement
     from pipelines.exports.surface.cloud import Cloud
     from pipelines.scene.cameras_file import CamerasFile
@@ -68,6 +66,10 @@ class PointcloudOptions(CropOptions):
         "0 for all. Unit: the world's.",
     )
     remove_outliers: bool = Field(True, description="Drop points far from their neighbours.")
+    snap_to_mesh: bool = Field(
+        True,
+        description="Lay points within two voxels of the job's mesh on it, with its normals.",
+    )
 
     @field_validator("formats")
     @classmethod
@@ -90,6 +92,8 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     from pipelines.exports.subject_files import as_dict
     from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
     from pipelines.exports.surface import cloud as clouds
+    from pipelines.exports.surface.snapping import snapped
+    from pipelines.exports.surface.surface_file import load_surface
     from pipelines.exports.surface.views import (
         known_depths,
         lens_of_pixels,
@@ -131,6 +135,10 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         store = render_views(scene, images, lenses, Path(folder), ctx, shares, known)
         ctx.progress(_RENDER_SHARE, "gathering points")
         cloud = clouds.gather(store, bounds)
+        surface = load_surface(ctx.workspace.stage("mesh")) if options.snap_to_mesh else None
+        if surface is not None:
+            told = ctx.told_part("laying points on the mesh", _RENDER_SHARE, 0.8)
+            cloud = snapped(cloud, surface, told)
         if thing is not None:
             cloud = cloud.take(thing.holds(cloud.points))
         elif crop is not None:
@@ -151,14 +159,16 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     if options.spacing:
         cloud = cloud.take(one_of_each_cube(cloud.points, options.spacing))
     cloud = clouds.thinned(cloud, options.num_points, ctx.seed)
-    ctx.progress(0.92, "estimating normals")
-    normals = clouds.oriented_normals(cloud, bounds.focus, _NORMAL_NEIGHBOURS)
+    num_on_mesh = int(cloud.normals.any(axis=1).sum())
+    told = ctx.told_part("estimating normals", 0.92, 0.97)
+    cloud = clouds.with_normals(cloud, _NORMAL_NEIGHBOURS, told)
     ctx.progress(0.97, "writing")
-    _write(cloud, normals, options, ctx, place, scene.cameras)
+    _write(cloud, options, ctx, place, scene.cameras)
     return {
         "frame": place.as_dict(),
         "formats": list(options.formats),
         "num_points": len(cloud),
+        "num_on_mesh": num_on_mesh,
         "num_views": len(images),
         "subject": subject,
         "crop": told_crop,
@@ -168,19 +178,18 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
 
 def _write(
     cloud: Cloud,
-    normals: NDArray[np.float64],
     options: PointcloudOptions,
     ctx: StageContext,
     place: Placement,
     cameras: CamerasFile,
 ) -> None:
-    """The files. normals: [P, 3]."""
+    """The files."""
     from pipelines.exports.formats import las, ply, xyz
     from pipelines.exports.formats.colmap import write_colmap_points
     from pipelines.exports.judged import JUDGED_CLOUD
 
     points, cameras = place.points(cloud.points), place.cameras(cameras)
-    content = (points, cloud.colors, place.directions(normals), place.frame())
+    content = (points, cloud.colors, place.directions(cloud.normals), place.frame())
     writers: dict[Format, Callable[[Path], None]] = {
         "ply": lambda path: ply.write_points(path, *content),
         "las": lambda path: las.write_points(path, *content),
@@ -207,8 +216,8 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=8,
-    reads=("depth",),
+    version=9,
+    reads=("depth", "mesh"),
     run=run,
     options=PointcloudOptions,
     artifacts=(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pipelines.exports.apart import run_apart
 from pipelines.exports.mesh import Floats, TriangleMesh, empty_mesh, ordered
 from pipelines.exports.surface import poisson_solver
-from pipelines.exports.surface.cloud import Cloud, oriented_normals
+from pipelines.exports.surface.cloud import Cloud, with_normals
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.exports.surface.tsdf import Sized
 from pipelines.exports.surface.view_colors import seen_colors
@@ -92,12 +92,12 @@ def reconstruct(
     cloud = cloud.take(consistent(cloud.points, told()))
     if len(cloud) < _FEWEST:
         return empty_mesh()
+    cloud = with_normals(cloud, on_progress=lambda done: on_progress(_AGREE_SHARE))
     points: Floats = cloud.points - origin
-    normals = oriented_normals(cloud, origin)
     on_progress(_ORIENTED_SHARE)
     given = {
         "points": points,
-        "normals": normals,
+        "normals": cloud.normals,
         "colors": cloud.colors.astype(np.float64) / 255.0,
         "width": np.float64(side),
     }
@@ -164,7 +164,7 @@ def averaged(
         left *= 0.5
     found: Floats = sums.total[agreed] / sums.num_views[agreed][:, None]
     colors = np.rint(found[:, 3:6]).astype(np.uint8)
-    return Cloud(found[:, :3] + bounds.box_min, colors, found[:, 6:]), side
+    return Cloud.seen(found[:, :3] + bounds.box_min, colors, found[:, 6:]), side
 
 
 def _near(mesh: TriangleMesh, points: Floats, reach: float) -> TriangleMesh:

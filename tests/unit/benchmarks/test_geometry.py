@@ -95,6 +95,9 @@ def test_a_finished_job_is_judged_without_running_it(job: Workspace, tmp_path: P
     assert found["poses"]["mean_center_error"] < 1e-6
     assert found["surface"]["precision"]["0.02"] > 0.99
     assert found["surface"]["recall"]["0.02"] > 0.9
+    assert found["cloud"]["precision"]["0.01"] > 0.99
+    assert found["cloud"]["accuracy"] < 1e-5
+    assert found["cloud"]["recall"]["0.01"] > 0.8
     normals = found["surface"]["normals"]
     assert normals["cloud"]["num_points"] > 500
     assert normals["cloud"]["median_deg"] < 0.1

@@ -7,8 +7,16 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.sample.film import phone_camera, walk
-from pipelines.sample.judge import SurfaceScores, judge_surface
-from pipelines.sample.scene import Floats, Scene, depth_image, pixel_rays, pose_matrix
+from pipelines.sample.judge import SurfaceScores, judge_cloud, judge_surface
+from pipelines.sample.scene import (
+    Floats,
+    Scene,
+    depth_image,
+    pixel_rays,
+    pose_matrix,
+    seen_surface,
+    surface_normals,
+)
 from pipelines.sample.scenes.catalogue import TAKES
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.orientation import Similarity
@@ -120,3 +128,24 @@ def test_no_mesh_scores_nothing() -> None:
     scores = _judged(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     assert scores.f_score == {0.01: 0.0, 0.02: 0.0}
     assert scores.completeness == np.inf
+
+
+def test_a_clouds_points_score_by_how_far_they_are() -> None:
+    points = seen_surface(TRUTH, ROOM.scene.subject, 60_000, ROOM.scene)
+    size = ROOM.scene.subject.size
+    exact = judge_cloud(points, IDENTITY, TRUTH, ROOM.scene, NUM_POINTS)
+    assert exact.accuracy < 1e-6
+    assert min(*exact.precision.values(), *exact.recall.values()) > 0.99
+    outward = surface_normals(points, ROOM.scene)
+    third = np.arange(len(points)) % 3 == 0
+    moved = points + 0.015 * size * np.where(third[:, None], outward, 0.0)
+    scores = judge_cloud(moved, IDENTITY, TRUTH, ROOM.scene, NUM_POINTS)
+    assert scores.precision[0.01] == pytest.approx(2 / 3, abs=0.03)
+    assert scores.precision[0.02] > 0.99
+    half = judge_cloud(
+        points[points[:, 0] < np.median(points[:, 0])], IDENTITY, TRUTH, ROOM.scene, NUM_POINTS
+    )
+    assert half.precision[0.01] > 0.99
+    assert 0.2 < half.recall[0.01] < 0.8
+    nothing = judge_cloud(np.zeros((0, 3)), IDENTITY, TRUTH, ROOM.scene, NUM_POINTS)
+    assert (nothing.f_score[0.02], nothing.accuracy) == (0.0, np.inf)

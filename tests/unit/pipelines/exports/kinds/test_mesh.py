@@ -19,6 +19,7 @@ from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.surface import poisson_solver, tsdf
 from pipelines.exports.surface.borders import border_loops
+from pipelines.exports.surface.surface_file import SURFACE
 from pipelines.exports.texture import charts
 from pipelines.judging.asset_views import Texture
 from pipelines.manifest import RunHooks
@@ -43,7 +44,8 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
     np.testing.assert_allclose(glb[:, 1].min(), mesh.points[:, 2].min(), atol=1e-4)
     np.testing.assert_allclose(glb[:, 2].max(), -mesh.points[:, 1].min(), atol=1e-4)
     files = {path.name for path in job.stage("mesh").iterdir()}
-    assert files == {"mesh.ply", "mesh.glb", "subject.glb", "subject.jpg", "manifest.json"}
+    delivered = {"mesh.ply", "mesh.glb", "subject.glb", "subject.jpg"}
+    assert files == {*delivered, SURFACE, "manifest.json"}
 
 
 def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
@@ -55,7 +57,7 @@ def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
     files = {file["path"] for file in manifest["files"]}
     artifacts = {artifact.path for artifact in get_stage("mesh").artifacts}
     assert files & artifacts == {"mesh.usdz", "mesh.stl", "subject.glb", "subject.jpg"}
-    assert files - artifacts == {"judged.glb"}
+    assert files - artifacts == {"judged.glb", SURFACE}
     judged = read_mesh(job.stage("mesh") / "judged.glb")
     assert isinstance(judged, TexturedMesh)
     assert len(judged.faces) == manifest["summary"]["num_faces"]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
+import open3d
 import pycolmap
 import pytest
 from numpy.typing import NDArray
@@ -18,6 +21,7 @@ from pipelines.exports.crop import crop_of
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.options import CropShapeOptions
+from pipelines.exports.surface.surface_file import load_surface
 from pipelines.registry import get_stage
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
@@ -74,6 +78,40 @@ def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
     np.testing.assert_allclose(
         laspy.read(job.stage("pointcloud") / "pointcloud.laz").xyz, judged, atol=1e-5
     )
+
+
+def _off(job: Workspace) -> NDArray[np.float64]:
+    """How far the cloud's points are from the job's mesh, in voxels."""
+    surface = load_surface(job.stage("mesh"))
+    assert surface is not None
+    cloud = read_ply(job.stage("pointcloud") / "pointcloud.ply")
+    tensor: Any = open3d.core.Tensor  # its stubs refuse its own documented calls
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(tensor(surface.vertices), tensor(surface.faces.astype(np.uint32)))
+    points = (cloud.points - surface.origin).astype(np.float32)
+    found = scene.compute_distance(tensor(points)).numpy() / surface.voxel.min()
+    return np.asarray(found, np.float64)
+
+
+def test_points_lie_on_the_jobs_mesh(job: Workspace) -> None:
+    tiny_job.run(job, "mesh", texture="none", triangles=500, frame="normalised")
+    summary = tiny_job.run(job, "pointcloud")["summary"]
+    off = _off(job)
+    on_it = off < 0.01
+    assert on_it.mean() > 0.6
+    assert abs(int(on_it.sum()) - summary["num_on_mesh"]) <= 0.01 * len(off)
+    summary = tiny_job.run(job, "pointcloud", snap_to_mesh=False)["summary"]
+    assert summary["num_on_mesh"] == 0
+    assert (_off(job) < 0.01).mean() < 0.1
+
+
+def test_without_a_mesh_points_stay_where_views_have_them(job: Workspace) -> None:
+    shutil.rmtree(job.stage("mesh"), ignore_errors=True)
+    assert tiny_job.run(job, "pointcloud")["summary"]["num_on_mesh"] == 0
+    alone = (job.stage("pointcloud") / "pointcloud.ply").read_bytes()
+    tiny_job.run(job, "mesh", texture="none")
+    tiny_job.run(job, "pointcloud", snap_to_mesh=False)
+    assert (job.stage("pointcloud") / "pointcloud.ply").read_bytes() == alone
 
 
 def _apart(points: NDArray[np.float32], least: float) -> float:

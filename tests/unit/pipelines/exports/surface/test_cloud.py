@@ -8,8 +8,8 @@ import pytest
 from pipelines.exports.surface.cloud import (
     Cloud,
     gather,
-    oriented_normals,
     thinned,
+    with_normals,
     without_outliers,
 )
 from pipelines.scene.bounds import SceneBounds
@@ -33,7 +33,7 @@ def test_points_and_normals_of_a_sphere_are_exact(views: list[DepthView]) -> Non
     np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1.0, atol=1e-5)
     np.testing.assert_allclose(cloud.colors / 255.0, sphere_color(cloud.points, CENTER), atol=0.01)
     assert consistent(cloud.points, views).mean() > 0.99
-    normals = oriented_normals(cloud, CENTER)
+    normals = with_normals(cloud).normals
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
     assert np.median((normals * outward).sum(axis=1)) > 0.98
     assert (normals * outward).sum(axis=1).min() > 0.0
@@ -43,8 +43,8 @@ def test_more_neighbours_make_normals_of_noisy_points_smoother() -> None:
     rng = np.random.default_rng(0)
     plane = np.column_stack([rng.random((4000, 2)), 0.01 * rng.standard_normal(4000)])
     eyes = np.tile([0.5, 0.5, 3.0], (4000, 1))
-    cloud = Cloud(plane, np.zeros((4000, 3), np.uint8), eyes)
-    few, many = (oriented_normals(cloud, np.zeros(3), count)[:, 2] for count in (20, 40))
+    cloud = Cloud.seen(plane, np.zeros((4000, 3), np.uint8), eyes)
+    few, many = (with_normals(cloud, count).normals[:, 2] for count in (20, 40))
     assert min(few.min(), many.min()) >= 0.0
     off_by, then = (float(np.median(np.arccos(np.clip(up, -1, 1)))) for up in (few, many))
     # A plane's slope is told by as many, over as much more area: both count by their root.
@@ -53,7 +53,7 @@ def test_more_neighbours_make_normals_of_noisy_points_smoother() -> None:
 
 def test_a_point_far_from_all_others_goes(views: list[DepthView]) -> None:
     cloud = gather(views, BOUNDS)
-    lonely = Cloud(
+    lonely = Cloud.seen(
         np.concatenate((cloud.points, CENTER[None] + 5.0)),
         np.concatenate((cloud.colors, cloud.colors[:1])),
         np.concatenate((cloud.eyes, cloud.eyes[:1])),
