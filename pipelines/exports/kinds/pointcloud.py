@@ -88,7 +88,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     from pipelines.exports.crop import empty_crop, narrowed, surface_in
     from pipelines.exports.formats.colmap import check_lenses
     from pipelines.exports.placement import placement_of
-    from pipelines.exports.spacing import one_of_each_cube
+    from pipelines.exports.spacing import least_crowded, one_of_each_cube
     from pipelines.exports.subject_files import as_dict
     from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
     from pipelines.exports.surface import cloud as clouds
@@ -158,7 +158,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         raise _empty("no surface lies within max_distance that views agree on")
     if options.spacing:
         cloud = cloud.take(one_of_each_cube(cloud.points, options.spacing))
-    cloud = clouds.thinned(cloud, options.num_points, ctx.seed)
+    cloud = cloud.take(least_crowded(cloud.points, options.num_points, ctx.seed))
     num_on_mesh = int(cloud.normals.any(axis=1).sum())
     told = ctx.told_part("estimating normals", 0.92, 0.97)
     cloud = clouds.with_normals(cloud, _NORMAL_NEIGHBOURS, told)

@@ -1,4 +1,4 @@
-"""Depth views as a cloud of points: gathered, rid of outliers, thinned, given normals.
+"""Depth views as a cloud of points: gathered, rid of outliers, given normals.
 
 P points, in the world frame. Whether views agree on a point is left to `scene.consistency`.
 """
@@ -80,14 +80,6 @@ def without_outliers(cloud: Cloud, origin: Floats) -> Cloud:
         return cloud
     _, kept = _legacy(cloud, origin).remove_statistical_outlier(_NEIGHBOURS, _OUTLIER_SIGMAS)
     return cloud.take(np.asarray(kept, np.int64))
-
-
-def thinned(cloud: Cloud, at_most: int, seed: int) -> Cloud:
-    """At most so many of the points, picked at random, in their order."""
-    if len(cloud) <= at_most:
-        return cloud
-    rng = np.random.default_rng(seed)
-    return cloud.take(np.sort(rng.choice(len(cloud), at_most, replace=False)))
 
 
 def with_normals(

@@ -24,6 +24,8 @@ _REACH_VOXELS = 2.0
 """So far a point may be from the surface: a view's noise is less than a voxel."""
 _LEAST_COSINE = 0.7
 """Of the move and the normal: beyond a border of the surface the nearest place lies aside."""
+_FACING = -0.4
+"""Least cosine of the normal and the way to the camera: at an outline, noise makes it negative."""
 _HARDLY_VOXELS = 0.1
 """A move as short as that has no direction worth asking."""
 _PORTION = 250_000
@@ -73,7 +75,8 @@ def _moved(
     move = (places - local).astype(np.float64)
     far, voxel = np.linalg.norm(move, axis=1), surface.voxel[corners[:, 0]]
     along = np.abs((move * normals).sum(axis=1)) >= _LEAST_COSINE * far
-    facing = ((eyes - points) * normals).sum(axis=1) > 0.0
+    to_eye = eyes - points
+    facing = (to_eye * normals).sum(axis=1) > _FACING * np.linalg.norm(to_eye, axis=1)
     onto = (far <= _REACH_VOXELS * voxel) & (along | (far <= _HARDLY_VOXELS * voxel))
     onto &= facing & (length > 0.5)
     return (

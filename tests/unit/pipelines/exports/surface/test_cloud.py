@@ -8,7 +8,6 @@ import pytest
 from pipelines.exports.surface.cloud import (
     Cloud,
     gather,
-    thinned,
     with_normals,
     without_outliers,
 )
@@ -61,13 +60,3 @@ def test_a_point_far_from_all_others_goes(views: list[DepthView]) -> None:
     kept = without_outliers(lonely, CENTER)
     assert np.linalg.norm(kept.points - CENTER, axis=1).max() < 1.01
     assert len(kept) > 0.9 * len(cloud)
-
-
-def test_thinning_keeps_points_with_what_belongs_to_them(views: list[DepthView]) -> None:
-    cloud = gather(views, BOUNDS)
-    few = thinned(cloud, 100, seed=1)
-    assert len(few) == 100
-    index = [int(np.abs(cloud.points - point).sum(axis=1).argmin()) for point in few.points]
-    np.testing.assert_array_equal(few.colors, cloud.colors[index])
-    np.testing.assert_array_equal(few.points, thinned(cloud, 100, seed=1).points)
-    assert len(thinned(few, 200, seed=1)) == 100
