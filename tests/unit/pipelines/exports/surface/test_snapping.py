@@ -63,7 +63,11 @@ def test_noise_goes_and_normals_are_the_surfaces(tmp_path: Path) -> None:
     found = snapped(_cloud(points, (0.0, 1.0, 3.0)), _kept(tmp_path, *_sheet(0.0)))
     local = found.points - FAR
     assert np.abs(local[:, 2]).max() < 1e-6
-    np.testing.assert_allclose(local[:, :2], points[:, :2], atol=1e-6)
+    # Along the rays, so that each keeps the colour that its pixel saw.
+    eye = np.array([0.0, 1.0, 3.0])
+    ways, then = points - eye, local - eye
+    aside = then - (then * ways).sum(axis=1, keepdims=True) / (ways**2).sum(axis=1)[:, None] * ways
+    assert np.abs(aside).max() < 1e-6
     np.testing.assert_allclose(found.normals, np.tile([0.0, 0.0, 1.0], (500, 1)), atol=1e-6)
 
 
@@ -83,18 +87,29 @@ def test_points_beyond_a_border_are_not_drawn_to_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.normals.any(axis=1), [False, False, True])
 
 
-def test_the_other_side_of_something_thin_is_left_alone(tmp_path: Path) -> None:
+def test_something_thin_keeps_both_of_its_sides(tmp_path: Path) -> None:
     above, faces = _sheet(0.05)
     below, turned = _sheet(-0.05, up=False)
     vertices = np.concatenate([above, below])
     surface = _kept(tmp_path, vertices, np.concatenate([faces, turned + len(above)]))
-    # Seen from below, and by its noise nearer to the upper side: that is not what was seen.
-    found = snapped(_cloud(np.array([[0.01, 0.0, 0.02]]), (0.0, 0.0, -3.0)), surface)
-    np.testing.assert_array_equal(found.points - FAR, np.array([[0.01, 0.0, 0.02]]) + FAR - FAR)
-    assert not found.normals.any()
-    found = snapped(_cloud(np.array([[0.01, 0.0, -0.02]]), (0.0, 0.0, -3.0)), surface)
-    np.testing.assert_allclose((found.points - FAR)[0], [0.01, 0.0, -0.05], atol=1e-6)
+    # Seen from below, and by its noise nearer to the upper side: the lower one is what was seen.
+    found = snapped(_cloud(np.array([[0.0, 0.0, 0.02]]), (0.0, 0.0, -3.0)), surface)
+    np.testing.assert_allclose((found.points - FAR)[0], [0.0, 0.0, -0.05], atol=1e-6)
     np.testing.assert_allclose(found.normals[0], [0.0, 0.0, -1.0], atol=1e-6)
+    # Of what lies above its upper side nobody saw anything from below.
+    beyond = np.array([[0.0, 0.0, 0.2]])
+    found = snapped(_cloud(beyond, (0.0, 0.0, -3.0)), surface)
+    np.testing.assert_array_equal(found.points, beyond + FAR)
+    assert not found.normals.any()
+
+
+def test_what_a_ray_passes_by_goes_to_the_nearest_place(tmp_path: Path) -> None:
+    low, high = np.array([[-0.3, 0.0, 0.05]]), (3.0, 0.0, 0.1)
+    surface = _kept(tmp_path, *_sheet(0.0))
+    found = snapped(_cloud(low, high), surface)
+    # At that glance the ray meets the sheet three units farther on.
+    np.testing.assert_allclose((found.points - FAR)[0], [-0.3, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found.normals[0], [0.0, 0.0, 1.0], atol=1e-6)
 
 
 def test_it_tells_and_can_be_stopped(tmp_path: Path) -> None:
