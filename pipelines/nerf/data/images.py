@@ -24,7 +24,7 @@ from pipelines.nerf.errors import NerfError
 from pipelines.nerf.options.train import SplitConfig
 from pipelines.nerf.space.cameras import reduced_size
 
-MIN_HELD_OUT = 5
+MIN_HELD_OUT = 3
 MASK_THRESHOLD = 128
 
 
@@ -32,7 +32,7 @@ def split_indices(num_images: int, config: SplitConfig) -> tuple[list[int], list
     """(training indices, held-out indices) of N images in order of their file names.
 
     `fraction`: training takes int(linspace(0, N - 1, n)) with n = ceil((1 - f) N), the rest is held
-    out; where that leaves fewer than 5, n is lowered until 5 are held out, or a quarter of a small
+    out; where that leaves fewer than 3, n is lowered until 3 are held out, or an eighth of a small
     capture. `interval`: indices 0, k, 2k... are held out. `stretch`: as many neighbours as
     `fraction` would hold out, starting int(place * (N - held out)) images along the path. `none`:
     nothing is. Raises NerfError `too_few_images` where nothing is left to train on.
@@ -62,10 +62,11 @@ def split_indices(num_images: int, config: SplitConfig) -> tuple[list[int], list
 
 
 def _num_held_out(num_images: int, fraction: float) -> int:
-    """N - ceil((1 - f) N), at least 5 or a quarter of a small capture."""
+    """N - ceil((1 - f) N), at least 3 or an eighth of a small capture."""
     # The small term keeps (1 - 0.1) * 50 = 45.00000000000001 from becoming 46.
     num_train = math.ceil((1.0 - fraction) * num_images - 1e-9)
-    return max(num_images - num_train, min(MIN_HELD_OUT, num_images // 4))
+    few = min(MIN_HELD_OUT, math.ceil(num_images / 8), num_images // 4)
+    return max(num_images - num_train, few)
 
 
 def memory_bytes(sizes: Sequence[tuple[int, int]], *, masked: bool) -> int:

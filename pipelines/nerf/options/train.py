@@ -36,11 +36,11 @@ class SplitConfig:
         choices=("fraction", "interval", "stretch", "none"),
     )
     eval_fraction: float = option(
-        0.1, "Share held out, at equal intervals, at least 5 images.", ge=0.0, le=0.9
+        0.1, "Share held out, at equal intervals, at least 3 images.", ge=0.0, le=0.9
     )
     eval_interval: int = option(8, "With `interval`: every n-th image is held out.", ge=2, le=1000)
     eval_stretch_fraction: float = option(
-        0.1, "With `stretch`: share held out, at least 5 images.", ge=0.0, le=0.9
+        0.1, "With `stretch`: share held out, at least 3 images.", ge=0.0, le=0.9
     )
     eval_stretch_place: float = option(
         0.5, "Where the stretch lies: 0 at the path's start, 1 at its end.", ge=0.0, le=1.0

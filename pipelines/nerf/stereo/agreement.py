@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-AGREE, SEE_THROUGH, HIDDEN = range(3)
+AGREE, SEE_THROUGH, HIDDEN, IN_PICTURE = range(4)
 
 
 def count_votes(
@@ -27,9 +27,10 @@ def count_votes(
     rays: x of each column [W] and y of each row [H] at z = 1. other_from_this: [3, 4].
     other: [H', W'], its depth. lens: [4] fx, fy, cx, cy of the other view, pixel centres at + 0.5.
     within: relative difference up to which depths agree.
-    votes: [3, H, W] int32: AGREE; SEE_THROUGH: the other view sees a surface behind the point, by
-    more than twice that; HIDDEN: one before it. sums: [H, W], of the depths in this view where it
-    agrees.
+    votes: [4, H, W] int32: AGREE; SEE_THROUGH: the other view sees a surface behind the point, by
+    more than twice that; HIDDEN: one before it; IN_PICTURE: the point lies before the other view
+    and within its picture, whatever that knows there.
+    sums: [H, W], of the depths in this view where it agrees.
     """
     x, y = rays[0][None, :] * depth, rays[1][:, None] * depth
     # Written out: a product of matrices may be rounded to fewer bits on a GPU.
@@ -38,6 +39,7 @@ def count_votes(
     u, v = fx * px / pz + cx, fy * py / pz + cy
     rows, columns = other.shape
     seen = (depth > 0) & (pz > 0) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+    votes[IN_PICTURE] += seen
     i, j = (torch.where(seen, w, 0.0).floor().long() for w in (u, v))
     known = torch.where(seen, other[j, i], 0.0)
     seen &= known > 0

@@ -67,7 +67,7 @@ class Engine(Protocol):
     ) -> Votes:
         """What others' depths say of a view's; see `stereo.agreement`.
 
-        Returns ([3, H, W] votes; [H, W] sums of the depths, in this view, of those that agree).
+        Returns ([4, H, W] votes; [H, W] sums of the depths, in this view, of those that agree).
         """
         ...
 
@@ -92,7 +92,7 @@ class KernelEngine:
         within: float,
     ) -> Votes:
         """As `Engine`."""
-        votes = np.zeros((3, *depth.shape), np.int32)
+        votes = np.zeros((4, *depth.shape), np.int32)
         sums = np.zeros(depth.shape, np.float32)
         rays = view.rays()
         for other, known in others:
@@ -132,7 +132,7 @@ class TorchEngine:
         with torch.inference_mode():
             mine = self._there(depth)
             rays = self._there(view.rays()[0]), self._there(view.rays()[1])
-            votes = torch.zeros(3, *mine.shape, dtype=torch.int32, device=self.device)
+            votes = torch.zeros(4, *mine.shape, dtype=torch.int32, device=self.device)
             sums = torch.zeros_like(mine)
             for other, known in others:
                 pose, lens = other.from_other(view), np.array(other.lens, np.float32)

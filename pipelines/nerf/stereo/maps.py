@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
+from pipelines.nerf.stereo.agreement import AGREE, IN_PICTURE, SEE_THROUGH
 from pipelines.nerf.stereo.engines import KERNELS, Engine, homographies_to
 from pipelines.nerf.stereo.neighbours import choose_neighbours, depth_range, spread_apart
 from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
@@ -30,6 +30,8 @@ _PROBE_NEAREST = 0.1
 _PROBE_FARTHEST = 100.0
 _PROBE_SHARE = 0.15
 _VOTE_SHARE = 0.1
+_FEW_PHOTOS, _LONELY = 40, 0.2
+"""Photos are few below that number, or where that share of what they show has one neighbour."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,28 @@ def find_depth_maps(
         share = (index + 1) / len(views) * (1.0 - begun - _VOTE_SHARE)
         on_progress(begun + share, f"depth {index + 1}/{len(views)}")
     maps = MapShelf.kept(shelves, "matched", len(views))
+    few = len(views) < _FEW_PHOTOS or lonely_share(views, points, neighbours) >= _LONELY
     for index in range(len(views)):
         if not maps.has(index):
-            maps[index] = agreed(index, views, raw, neighbours[index], config, engine)
+            maps[index] = agreed(
+                index, views, raw, neighbours[index], config, engine, few_photos=few
+            )
         on_progress(1.0 - _VOTE_SHARE * (1.0 - (index + 1) / len(views)), "comparing depths")
     return maps
+
+
+def lonely_share(
+    views: Sequence[StereoView], points: Floats, neighbours: Sequence[Sequence[int]]
+) -> float:
+    """How much of what views show lies in the picture of at most one of their neighbours, [0, 1].
+
+    points: [P, 3], of what they show, also where something hides it.
+    """
+    shown = np.array([view.seen(points)[1] for view in views])
+    others = np.zeros(shown.shape, np.int64)
+    for index, chosen in enumerate(neighbours):
+        others[index] = shown[list(chosen)].sum(axis=0)
+    return float((others[shown] <= 1).mean()) if shown.any() else 0.0
 
 
 def find_points(
@@ -230,11 +249,19 @@ def agreed(
     neighbours: Sequence[int],
     config: StereoConfig,
     engine: Engine = KERNELS,
+    *,
+    few_photos: bool = False,
 ) -> DepthMap:
-    """A view's depths that enough neighbours confirm, and not more see through; averaged."""
+    """A view's depths that enough neighbours confirm, and not more see through; averaged.
+
+    few_photos: whether one is enough where a single one has the place in its picture.
+    """
     depth = depths[index]
     votes, sums = votes_of_others(depth, index, views, depths, neighbours, config, engine)
-    kept = (depth > 0) & (votes[AGREE] >= config.min_agreeing) & (votes[AGREE] > votes[SEE_THROUGH])
+    enough = np.full(depth.shape, config.min_agreeing)
+    if few_photos:
+        enough[votes[IN_PICTURE] == 1] = min(1, config.min_agreeing)
+    kept = (depth > 0) & (votes[AGREE] >= enough) & (votes[AGREE] > votes[SEE_THROUGH])
     mean = (depth + sums) / (1.0 + votes[AGREE])
     return DepthMap(
         np.where(kept, mean, 0.0).astype(np.float32),

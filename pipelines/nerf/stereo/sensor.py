@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
+from pipelines.nerf.stereo.agreement import AGREE, IN_PICTURE, SEE_THROUGH
 from pipelines.nerf.stereo.engines import KERNELS, Engine
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf, surface_points, votes_of_others
 from pipelines.nerf.stereo.neighbours import choose_neighbours
@@ -86,7 +86,9 @@ def sensor_maps(
     for index, z in enumerate(maps):
         votes, sums = votes_of_others(z, index, views, maps, neighbours[index], config, engine)
         agreeing = votes[AGREE]
-        believed = (z > 0) & ((agreeing > votes[SEE_THROUGH]) | (votes.sum(axis=0) == 0))
+        believed = (z > 0) & (
+            (agreeing > votes[SEE_THROUGH]) | (votes[:IN_PICTURE].sum(axis=0) == 0)
+        )
         mean = np.where(believed, (z + sums) / (1.0 + agreeing), 0.0).astype(np.float32)
         kept[index] = DepthMap(mean, np.where(believed, agreeing, 0).astype(np.uint8))
     return kept

@@ -18,7 +18,7 @@ from pipelines.workspace import MANIFEST, Workspace
 from tests.unit.pipelines.stages import tiny_job
 
 OPTIONS = {"long_side_px": 64, "num_planes": 24, "window_radius": 2, "num_neighbours": 4}
-NUM_IMAGES, NUM_VIEWS = 12, 9
+NUM_IMAGES, NUM_VIEWS = 12, 10
 
 
 @pytest.fixture

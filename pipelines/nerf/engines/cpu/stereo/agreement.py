@@ -32,6 +32,7 @@ def _vote(share, shares, depth, ray_x, ray_y, there, other, back, lens, within, 
             u, v = fx * px / pz + cx, fy * py / pz + cy
             if not (u >= 0.0 and v >= 0.0 and u < columns and v < rows):
                 continue
+            votes[3, y, x] += 1
             i, j = int(u), int(v)
             known = other[j, i]
             if known <= 0.0:
@@ -59,7 +60,7 @@ def count_votes_fast(
     votes: NDArray[np.int32],
     sums: Floats,
 ) -> None:
-    """As `stereo.agreement.count_votes`, adding to `votes` [3, H, W] and `sums` [H, W]."""
+    """As `stereo.agreement.count_votes`, adding to `votes` [4, H, W] and `sums` [H, W]."""
     rotation = other_from_this[:, :3]
     back = np.append(rotation[:, 2], -rotation[:, 2] @ other_from_this[:, 3]).astype(np.float32)
     run_threads(

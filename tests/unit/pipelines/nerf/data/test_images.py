@@ -37,9 +37,10 @@ def test_fraction_is_nerfstudios_formula_for_every_capture_of_fifty_images(num_i
 
 
 @pytest.mark.parametrize(
-    ("num_images", "held_out"), [(210, 21), (50, 5), (30, 5), (20, 5), (11, 2), (8, 2), (3, 0)]
+    ("num_images", "held_out"),
+    [(210, 21), (50, 5), (30, 3), (20, 3), (11, 2), (8, 1), (4, 1), (3, 0)],
 )
-def test_fraction_holds_out_a_tenth_and_at_least_five_where_it_can(
+def test_fraction_holds_out_a_tenth_and_at_least_three_where_it_can(
     num_images: int, held_out: int
 ) -> None:
     train, test = split_indices(num_images, DataConfig())
@@ -64,8 +65,8 @@ def test_interval_and_none_and_zero() -> None:
         (50, 0.1, 1.0, range(45, 50)),
         (210, 0.1, 0.5, range(94, 115)),  # 21 of 210
         (100, 0.25, 0.2, range(15, 40)),  # 25 of 100, a fifth of the other 75 before
-        (20, 0.1, 0.5, range(7, 12)),  # 2 would be too few, so 5
-        (8, 0.1, 0.5, range(3, 5)),  # a quarter of a small capture
+        (20, 0.1, 0.5, range(8, 11)),  # 2 would be too few, so 3
+        (8, 0.1, 0.5, range(3, 4)),  # an eighth of a small capture
         (50, 0.0, 0.5, range(0)),
     ],
 )

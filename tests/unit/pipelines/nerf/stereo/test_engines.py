@@ -68,7 +68,7 @@ def test_nothing_of_the_cpu_is_mixed_in_and_no_value_asked_for() -> None:
         picture, others = torch.ones(20, 24), torch.ones(3, 18, 26)
         maps, weights = torch.ones(3, 9, 3, 3), torch.ones(4, 20, 24)
         rays, pose, lens = (torch.ones(24), torch.ones(20)), torch.ones(3, 4), torch.ones(4)
-        votes, sums = torch.zeros(3, 20, 24, dtype=torch.int32), torch.zeros(20, 24)
+        votes, sums = torch.zeros(4, 20, 24, dtype=torch.int32), torch.zeros(20, 24)
     cost = matching_cost(picture, others, maps, 2, at_once=4)
     planes, margins = aggregate(cost, weights, 0.3, 5.0)
     count_votes(picture, rays, pose, others[0], lens, 0.02, votes, sums)

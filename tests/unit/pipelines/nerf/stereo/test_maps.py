@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import back_project, find_depth_maps
+from pipelines.nerf.stereo import maps as maps_module
+from pipelines.nerf.stereo.maps import back_project, find_depth_maps, lonely_share
 from pipelines.nerf.stereo.neighbours import choose_neighbours, depth_range, spread_apart
 from pipelines.nerf.stereo.views import StereoView
 from tests.unit.pipelines.nerf.stereo.painted_wall import look, row_of_cameras
@@ -100,6 +101,38 @@ def test_a_view_that_nobody_shares_has_an_empty_map() -> None:
     maps = find_depth_maps([*views, lonely], CONFIG, known_points(views, depths))
     assert not maps[5].z.any()
     assert maps[2].z.any()
+
+
+def test_with_few_photos_one_neighbour_is_enough_where_no_other_could_tell(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    views, depths = row_of_cameras(2, 0.3)
+    points = known_points(views, depths)
+    found = find_depth_maps(views, CONFIG, points)[0]
+    known = found.z > 0
+    assert known.mean() > 0.5
+    assert (np.abs(found.z / depths[0] - 1.0)[known] < 0.03).mean() > 0.95
+    assert set(found.votes[known].tolist()) == {1}
+    # Others could tell in the middle of three: there two have to agree, as ever.
+    views, depths = row_of_cameras(3, 0.3)
+    middle = find_depth_maps(views, CONFIG, known_points(views, depths))[1]
+    inner = middle.votes[:, 40:-40]
+    assert set(inner[inner > 0].tolist()) == {2}
+    monkeypatch.setattr(maps_module, "_FEW_PHOTOS", 0)
+    many = find_depth_maps(views[:2], CONFIG, known_points(views, depths))
+    assert many[0].z.any(), "of what these two show one neighbour shows all"
+    monkeypatch.setattr(maps_module, "_LONELY", 2.0)
+    assert not find_depth_maps(views[:2], CONFIG, known_points(views, depths))[0].z.any()
+
+
+def test_what_is_shown_to_one_neighbour_at_most_is_lonely() -> None:
+    views, depths = row_of_cameras(4, 0.02)
+    points = known_points(views, depths)
+    others = [[j for j in range(4) if j != k] for k in range(4)]
+    assert lonely_share(views, points, others) < 0.05
+    assert lonely_share(views, points, [[1], [0], [3], [2]]) == 1.0
+    assert lonely_share(views, points, [[], [], [], []]) == 1.0
+    assert lonely_share(views, points + np.array([0.0, 0.0, -100.0]), others) == 0.0
 
 
 def test_what_the_picture_does_not_have_has_no_depth() -> None:

@@ -56,9 +56,9 @@ def test_votes_equal_their_plain_twin() -> None:
     noisy = (depth * rng.choice([1.0, 1.01, 0.9, 1.2, 0.0], depth.shape)).astype(np.float32)
     seen = np.where(rng.random(behind.shape) < 0.1, 0.0, behind).astype(np.float32)
     pose, lens = other.from_other(view), np.array(other.lens, np.float32)
-    votes, sums = np.zeros((3, *depth.shape), np.int32), np.zeros(depth.shape, np.float32)
+    votes, sums = np.zeros((4, *depth.shape), np.int32), np.zeros(depth.shape, np.float32)
     count_votes_fast(noisy, view.rays(), pose, seen, lens, 0.02, votes, sums)
-    plain_votes = torch.zeros(3, *depth.shape, dtype=torch.int32)
+    plain_votes = torch.zeros(4, *depth.shape, dtype=torch.int32)
     plain_sums = torch.zeros(*depth.shape)
     rays = tuple(torch.from_numpy(item) for item in view.rays())
     count_votes(
