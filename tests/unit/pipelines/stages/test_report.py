@@ -35,7 +35,7 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
     metrics = report["metrics"]
     assert metrics["psnr"] > 9.0
     assert 0.0 < metrics["ssim"] < 1.0
-    assert metrics["num_images"] == len(metrics["per_image"]) == 5
+    assert metrics["num_images"] == len(metrics["per_image"]) == 3
     assert (metrics["width"], metrics["height"]) == (36, 64)
     assert metrics["protocol"]["name"] == "custom"
     assert metrics["protocol"]["split"] == "fraction 0.9"
@@ -50,7 +50,7 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
         assert 0.0 <= assets[name]["coverage"] <= 1.0
         assert assets[name]["psnr_with_holes"] > 0.0
         assert {"psnr", "ssim"} <= set(assets[name])
-    assert assets["views"]["num_views"] == 5
+    assert assets["views"]["num_views"] == 3
     assert assets["depth_reason"]
     assert "warnings" not in assets
     assert assets["subject"] == report["stages"]["mesh"]["subject"]

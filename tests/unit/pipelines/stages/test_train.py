@@ -26,7 +26,7 @@ def test_summary_says_what_was_trained(trained_job: Workspace) -> None:
     summary = trained_job.manifest("train")["summary"]
     assert summary["num_steps"] == 400
     assert summary["num_train"] + summary["num_test"] == tiny_job.NUM_IMAGES
-    assert summary["num_test"] == 5
+    assert summary["num_test"] == 3
     assert (summary["width"], summary["height"]) == (36, 64)
     assert summary["train_psnr"] > 9.0
     assert set(summary["losses"]) >= {"rgb", "interlevel", "distortion", "camera"}
@@ -80,8 +80,8 @@ def test_model_holds_all_that_rendering_needs(trained_job: Workspace, tmp_path: 
     alone = tmp_path / "model.zip"
     alone.write_bytes((trained_job.stage("train") / "model.zip").read_bytes())
     scene = TrainedScene.load(alone)
-    assert len(scene.training_images()) == 15
-    assert len(scene.test_images()) == 5
+    assert len(scene.training_images()) == 17
+    assert len(scene.test_images()) == 3
     image = scene.test_images()[0]
     picture = scene.render(scene.lens_of(image), np.asarray(image.world_from_camera), 32)
     assert picture.rgb.shape == (32, 18, 3)
@@ -104,7 +104,7 @@ def test_cameras_carry_the_corrections_of_training_images_only(trained_job: Work
         np.testing.assert_allclose(moved, deltas[row, :3], atol=1e-6)
         np.testing.assert_allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-6)
         row += 1
-    assert row == 15
+    assert row == 17
     assert after.cameras == before.cameras
     assert "training" in after.notes
 
