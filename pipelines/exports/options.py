@@ -122,7 +122,7 @@ class CropOptions(RenderingOptions, ExtentOptions, FrameOptions):
     use_depth_maps: Literal["auto", "on", "off"] = Field(
         "auto",
         description="Let the depth maps of the stage depth vote on surfaces beside the trained "
-        "field. auto does so where a sensor measured some of them.",
+        "field. auto does so where a sensor measured some of them, or they are fewer than 40.",
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.stereo.maps import FEW_PHOTOS
 from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_sampling import sampled
 from pipelines.scene.depth_views import DepthView, Pinhole
@@ -30,6 +31,11 @@ class KnownDepths:
     def measured(self) -> bool:
         """Whether a sensor had a part in the maps."""
         return self._maps.measured
+
+    @property
+    def few(self) -> bool:
+        """Whether they are of so few photos that many places are in one or two of them."""
+        return len(self._index) < FEW_PHOTOS
 
     def view_of(self, file: str, view: DepthView) -> DepthView | None:
         """What the map of an image says, as another view of it has its pixels; None without one."""

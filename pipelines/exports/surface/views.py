@@ -75,4 +75,4 @@ def known_depths(workspace: Workspace, wanted: str) -> KnownDepths | None:
     if wanted == "off" or not workspace.is_complete("depth"):
         return None
     known = KnownDepths(workspace.stage("depth"))
-    return known if wanted == "on" or known.measured else None
+    return known if wanted == "on" or known.measured or known.few else None

@@ -30,7 +30,7 @@ _PROBE_NEAREST = 0.1
 _PROBE_FARTHEST = 100.0
 _PROBE_SHARE = 0.15
 _VOTE_SHARE = 0.1
-_FEW_PHOTOS, _LONELY = 40, 0.2
+FEW_PHOTOS, _LONELY = 40, 0.2
 """Photos are few below that number, or where that share of what they show has one neighbour."""
 
 
@@ -131,7 +131,7 @@ def find_depth_maps(
         share = (index + 1) / len(views) * (1.0 - begun - _VOTE_SHARE)
         on_progress(begun + share, f"depth {index + 1}/{len(views)}")
     maps = MapShelf.kept(shelves, "matched", len(views))
-    few = len(views) < _FEW_PHOTOS or lonely_share(views, points, neighbours) >= _LONELY
+    few = len(views) < FEW_PHOTOS or lonely_share(views, points, neighbours) >= _LONELY
     for index in range(len(views)):
         if not maps.has(index):
             maps[index] = agreed(

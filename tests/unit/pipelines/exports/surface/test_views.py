@@ -15,23 +15,26 @@ from pipelines.workspace import MANIFEST, Workspace
 
 
 @pytest.mark.parametrize(
-    ("wanted", "measured", "taken"),
+    ("wanted", "measured", "count", "taken"),
     [
-        ("auto", True, True),
-        ("auto", False, False),
-        ("on", False, True),
-        ("off", True, False),
+        ("auto", True, 40, True),
+        ("auto", False, 40, False),
+        ("auto", False, 39, True),
+        ("on", False, 40, True),
+        ("off", True, 39, False),
     ],
 )
-def test_maps_vote_where_a_sensor_measured_or_they_are_asked_to(
-    tmp_path: Path, wanted: str, measured: bool, taken: bool
+def test_maps_vote_where_a_sensor_measured_or_they_are_few_or_asked_to(
+    tmp_path: Path, wanted: str, measured: bool, count: int, taken: bool
 ) -> None:
     workspace = Workspace(tmp_path)
     assert known_depths(workspace, wanted) is None, "there are no maps yet"
     folder = workspace.stage("depth")
     writer = DepthMapsWriter(folder)
     ones = np.ones((4, 6), np.float32)
-    writer.append("a.jpg", Pinhole(6, 4, 5.0, 5.0, 3.0, 2.0), DepthMap(ones, ones.astype(np.uint8)))
+    for index in range(count):
+        found = DepthMap(ones, ones.astype(np.uint8))
+        writer.append(f"{index}.jpg", Pinhole(6, 4, 5.0, 5.0, 3.0, 2.0), found)
     writer.close(measured=measured)
     (folder / MANIFEST).write_text('{"stage": "depth"}', "utf-8")
     known = known_depths(workspace, wanted)

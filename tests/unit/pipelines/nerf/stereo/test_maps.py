@@ -118,7 +118,7 @@ def test_with_few_photos_one_neighbour_is_enough_where_no_other_could_tell(
     middle = find_depth_maps(views, CONFIG, known_points(views, depths))[1]
     inner = middle.votes[:, 40:-40]
     assert set(inner[inner > 0].tolist()) == {2}
-    monkeypatch.setattr(maps_module, "_FEW_PHOTOS", 0)
+    monkeypatch.setattr(maps_module, "FEW_PHOTOS", 0)
     many = find_depth_maps(views[:2], CONFIG, known_points(views, depths))
     assert many[0].z.any(), "of what these two show one neighbour shows all"
     monkeypatch.setattr(maps_module, "_LONELY", 2.0)
