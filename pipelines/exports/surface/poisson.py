@@ -37,7 +37,7 @@ MOST_POINTS = 2_000_000
 _COARSER = 1.05
 _STRAY_CUBES = 2.0
 """The surface ends so many cubes from the nearest point."""
-_FEWEST = 100
+_FEWEST = 30
 _BESIDE_CUBES = 3.0
 """How far the surface may lie from a view's depth, along its axis, to be what that view sees."""
 _GATHER_SHARE, _AGREE_SHARE, _ORIENTED_SHARE, _SOLVED_SHARE = 0.4, 0.5, 0.52, 0.85

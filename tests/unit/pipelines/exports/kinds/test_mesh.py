@@ -275,7 +275,7 @@ def test_a_subject_asked_for_is_the_mesh_and_a_crop_overrides_it(job: Workspace)
     size, center = np.asarray(found["region"]["size"]), np.asarray(found["region"]["center"])
     assert (np.abs(mesh.vertices[:, 2] - center[2]) <= size[2] / 2.0 + 1e-4).all()
     assert (high - low)[:2].max() <= np.hypot(*size[:2])
-    crop = {"shape": "box", "center": center.tolist(), "size": (size / 2.0).tolist()}
+    crop = {"shape": "box", "center": center.tolist(), "size": (0.8 * size).tolist()}
     by_hand = tiny_job.run(job, "mesh", crop=crop, texture="none")["summary"]
     assert by_hand["subject"] is None
     assert not (job.stage("mesh") / "subject.glb").exists()

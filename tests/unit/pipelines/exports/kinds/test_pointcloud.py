@@ -123,7 +123,7 @@ def _apart(points: NDArray[np.float32], least: float) -> float:
 def test_points_keep_the_spacing_asked_for_and_face_the_cameras(job: Workspace) -> None:
     tiny_job.run(job, "pointcloud")
     dense = read_ply(job.stage("pointcloud") / "pointcloud.ply").points
-    spacing = 0.02 * float(np.ptp(dense, axis=0).max())
+    spacing = 0.03 * float(np.ptp(dense, axis=0).max())
     tiny_job.run(job, "pointcloud", spacing=spacing)
     cloud = read_ply(job.stage("pointcloud") / "pointcloud.ply")
     assert 50 < len(cloud.points) < 0.7 * len(dense)
