@@ -168,7 +168,10 @@ def test_made_capture_looks_at_its_centre(tmp_path: Path) -> None:
 
 
 @pytest.mark.captures
-@pytest.mark.skipif("NERFWORKS_CAPTURES" not in os.environ, reason="needs the real captures")
+@pytest.mark.skipif(
+    "NERFWORKS_CAPTURES" not in os.environ,
+    reason="NERFWORKS_CAPTURES does not name the folder of real captures",
+)
 def test_fox_is_split_as_the_reference_split_it() -> None:
     folder = Path(os.environ["NERFWORKS_CAPTURES"]) / "photos-fox"
     capture = load_capture(folder, DataConfig(long_side_px=48))

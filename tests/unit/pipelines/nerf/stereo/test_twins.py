@@ -10,7 +10,7 @@ from pipelines.nerf.engines.cpu.stereo.aggregation import aggregate_fast
 from pipelines.nerf.engines.cpu.stereo.agreement import count_votes_fast
 from pipelines.nerf.engines.cpu.stereo.matching import matching_cost_fast
 from pipelines.nerf.stereo.aggregation import aggregate, jump_weights
-from pipelines.nerf.stereo.agreement import AGREE, HIDDEN, SEE_THROUGH, count_votes
+from pipelines.nerf.stereo.agreement import AGREE, HIDDEN, IN_PICTURE, SEE_THROUGH, count_votes
 from pipelines.nerf.stereo.matching import matching_cost, plane_homographies
 from tests.unit.pipelines.nerf.stereo.painted_wall import look, row_of_cameras
 
@@ -74,5 +74,8 @@ def test_votes_equal_their_plain_twin() -> None:
     assert (votes != plain_votes.numpy()).mean() < 1e-3  # a pixel on a border by rounding
     same = votes[AGREE] == plain_votes[AGREE].numpy()
     assert np.abs(sums - plain_sums.numpy())[same].max() < 1e-4
-    for kind in (AGREE, SEE_THROUGH, HIDDEN):
+    for kind in (AGREE, SEE_THROUGH, HIDDEN, IN_PICTURE):
         assert votes[kind].sum() > 50
+    told = votes[[AGREE, SEE_THROUGH, HIDDEN]].sum(axis=0)
+    assert (told <= votes[IN_PICTURE]).all()
+    assert (told < votes[IN_PICTURE]).any(), "in a picture that knows nothing there"
