@@ -142,7 +142,8 @@ class Scene:
     sRGB. light: [3], a lamp inside the room. subject: what meshes are judged on; its longest side
     is the size that tolerances refer to. things: the same without floor and walls, which fit onto
     themselves under many wrong moves. beyond: how far outside the subject a mesh is judged, metres:
-    of a room, whose wrong walls lie outside it.
+    of a room, whose wrong walls lie outside it. reach: what is farther away, metres, is the sky and
+    has no depth.
     """
 
     name: str
@@ -152,6 +153,7 @@ class Scene:
     subject: Region
     things: Region
     beyond: float = 0.0
+    reach: float = math.inf
 
     @cached_property
     def room(self) -> Region:
@@ -261,12 +263,13 @@ def pixel_rays(
 
 
 def depth_image(camera: Intrinsics, world_from_camera: Floats, scene: Scene = SAMPLE) -> Floats:
-    """Exact z-depth at the pixel centres, [H, W], metres."""
+    """Exact z-depth at the pixel centres, [H, W], metres; 0 for the sky."""
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     origins, directions = pixel_rays(camera, world_from_camera, pixels)
     forward = -world_from_camera[:, 2]
-    z_depth: Floats = raycast(origins, directions, scene).t * (directions @ forward)
+    distance = raycast(origins, directions, scene).t
+    z_depth: Floats = np.where(distance < scene.reach, distance, 0.0) * (directions @ forward)
     return z_depth.reshape(camera.height, camera.width)
 
 

@@ -50,6 +50,7 @@ from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.scene.trained_scene import nerf_cameras, nerf_errors_as
 from pipelines.stage import StageContext
 from pipelines.stages.evaluate import picture_name
+from pipelines.stages.sky_masks import sky_masks
 from pipelines.workspace import Workspace
 
 NO_AGREED_DEPTH = "This job made no depth maps that views agree on."
@@ -64,6 +65,7 @@ class Views:
 
     cameras: in `frame`, the world less its origin. held_out: whether training never saw them.
     bend: of the camera's curve, where assets have the mean light, which each photo differs from.
+    sky: [H, W] of each photo, where it shows the sky; None in captures without any.
     """
 
     posed: list[PosedImage]
@@ -72,6 +74,7 @@ class Views:
     frame: SceneTransform
     held_out: bool
     bend: float | None = None
+    sky: list[NDArray[np.bool_]] | None = None
 
     def photo(self, index: int) -> NDArray[np.float32]:
         """[H, W, 3] in [0, 1]."""
@@ -79,9 +82,13 @@ class Views:
         return photo
 
     def valid(self, index: int) -> NDArray[np.bool_] | None:
-        """[H, W], or None where all of it counts."""
+        """[H, W], or None where all of it counts. The sky does not: nothing is to be there."""
         mask = self.images.mask(index)
-        return None if mask is None else mask.numpy()
+        valid = None if mask is None else mask.numpy()
+        if self.sky is None or self.sky[index].all():
+            return valid
+        below = ~self.sky[index]
+        return below if valid is None else valid & below
 
     def lit(self, view: AssetView, index: int) -> AssetView:
         """A view of an asset in the light of the photo."""
@@ -123,6 +130,7 @@ def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
         "depth": depth,
         "depth_reason": no_depth,
         "depth_inconsistency": floaters,
+        "sky": _before_sky(seen.views, views),
         "warnings": [] if warning is None else [warning],
         "definitions": DEFINITIONS,
         "per_view": [
@@ -161,7 +169,8 @@ def load_views(workspace: Workspace, options: AssessOptions) -> Views:
         )
         lenses = [cameras.cameras[image.camera] for image in posed]
         sized = nerf_cameras(lenses, poses, frame).resized(options.long_side_px)
-    return Views(posed, images, sized, frame, bool(held_out), cameras.bend)
+    sky = sky_masks(workspace, cameras, posed, sized)
+    return Views(posed, images, sized, frame, bool(held_out), cameras.bend, sky)
 
 
 def describe(views: Views) -> dict[str, Any]:
@@ -231,6 +240,18 @@ def _look_at_cloud(
         rows.append(score_view(view, views.photo(index), views.valid(index)))
         ctx.progress(0.6 + 0.35 * (index + 1) / len(views.posed), "looking at the cloud")
     return rows, round(float(np.median(spacing)), 6)
+
+
+def _before_sky(seen: list[AssetView], views: Views) -> dict[str, float] | None:
+    """How much of the photos is sky, and how much of that the mesh hides; None without any."""
+    if views.sky is None:
+        return None
+    num_sky = sum(int(mask.sum()) for mask in views.sky)
+    hidden = sum(int((view.hit & mask).sum()) for view, mask in zip(seen, views.sky, strict=True))
+    return {
+        "share": round(num_sky / sum(mask.size for mask in views.sky), 4),
+        "hidden": round(hidden / max(num_sky, 1), 4),
+    }
 
 
 def _floaters(workspace: Workspace) -> float | None:

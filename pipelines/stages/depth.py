@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from pipelines.nerf.stereo.maps import MapShelf, Progress, find_depth_maps, surf
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.sensor import merged_maps, sensor_maps, sensor_scale
 from pipelines.nerf.stereo.shelves import Shelf
+from pipelines.nerf.stereo.sky import find_sky, without
 from pipelines.nerf.stereo.standing import stood_up
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.option_models import StageOptions
@@ -42,12 +43,13 @@ from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.natural_order import natural_key
+from pipelines.scene.orientation import find_up
 from pipelines.scene.stereo_views import sensor_depth, stereo_view, undistorted_picture
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 from pipelines.stages.depth_checkpoint import DepthCheckpoint, inputs_of
 
-_LOAD_SHARE, _STEREO_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.72, 0.1, 0.1
+_LOAD_SHARE, _STEREO_SHARE, _SKY_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.7, 0.02, 0.1, 0.1
 _LIGHT_SHARE = 0.03
 _PICTURE_VIEWS = 6
 
@@ -94,7 +96,7 @@ class _Search:
     """The passes over a capture's views, each complete in the checkpoint before the next begins.
 
     source: "stereo", or with a sensor "auto" or "sensor". patches: of the pictures, where they were
-    looked for.
+    looked for. colors: the pictures, where they were asked for.
     """
 
     ctx: StageContext
@@ -106,6 +108,7 @@ class _Search:
     engine: Engine
     checkpoint: DepthCheckpoint
     patches: Shelf
+    colors: Shelf
     started: float
 
     @classmethod
@@ -127,12 +130,13 @@ class _Search:
         with nerf_errors_as(TrainingError):
             engine = choose_engine(views, config)
         files = [image.file for image in images]
-        told = [inputs_of(ctx), files, asdict(config), source, _device(engine)]
-        checkpoint = DepthCheckpoint(ctx, len(views), told)
-        patches = checkpoint.shelves.scratch("patches", len(views))
-        return cls(
-            ctx, capture, images, views, config, source, engine, checkpoint, patches, started
+        depends = [inputs_of(ctx), files, asdict(config), source, _device(engine)]
+        checkpoint = DepthCheckpoint(ctx, len(views), depends)
+        patches, colors = (
+            checkpoint.shelves.scratch(name, len(views)) for name in ("patches", "colors")
         )
+        told = ctx, capture, images, views, config, source
+        return cls(*told, engine, checkpoint, patches, colors, started)
 
     @property
     def device(self) -> str:
@@ -142,6 +146,8 @@ class _Search:
     def all_passes(self) -> Found:
         """Maps of all images, and what is told of them."""
         passes: list[tuple[str, Callable[[], Found]]] = [("matched", self._matched)]
+        if self.config.find_sky:
+            passes.append(("sky", self._without_sky))
         if self.config.complete_planes:
             passes.append(("planes", self._completed))
         if self.config.standing_walls:
@@ -149,7 +155,18 @@ class _Search:
         for name, work in passes:
             if name not in self.checkpoint.passes:
                 self.checkpoint.complete(name, *work())
+            if name == "sky" and self.checkpoint.told["sky"]["share"] > 0.0:
+                self._see_no_sky()
         return self.checkpoint.maps(), self.checkpoint.told
+
+    def color_picture(self, index: int) -> NDArray[np.uint8]:
+        """A view's picture in colour, [H, W, 3], sRGB."""
+        if not self.colors.has(index):
+            image, view = self.images[index], self.views[index]
+            lens, root = self.capture.cameras[image.camera], self.ctx.workspace.images_root
+            self.colors[index] = undistorted_picture(root, image, lens, _pinhole(view))
+        picture: NDArray[np.uint8] = self.colors[index]
+        return picture
 
     def _progress(self, begun: float, share: float) -> Progress:
         """Of a part of the stage. What is found so far is offered, before a cancel ends it."""
@@ -203,17 +220,53 @@ class _Search:
             found.append(sensor_depth(root, image, lens, _pinhole(view)))
         return found
 
+    def _without_sky(self) -> Found:
+        maps, views = self.checkpoint.maps(), self.views
+        points = _known_points(self.ctx)
+        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _SKY_SHARE)
+
+        def half_done(begun: float) -> Callable[[float], None]:
+            return lambda share: on_progress(begun + 0.5 * share, "looking for the sky")
+
+        poses = np.array([image.world_from_camera for image in self.capture.images], np.float64)
+        sky = find_sky(
+            views,
+            self.color_picture,
+            maps.z,
+            find_up(poses)[0],
+            np.zeros((0, 3)) if points is None else points,
+            self.patches,
+            half_done(0.0),
+        )
+        told = {
+            "share": round(sky.share, 4),
+            "num_views": sky.num_views,
+            "far": round(sky.far, 3),
+        }
+        if sky.share > 0.0:
+            shelves = self.checkpoint.shelves
+            maps = without(sky, views, maps, self.config, half_done(0.5), self.engine, shelves)
+            self.ctx.logger.info("nothing stands where the pictures show the sky: %s", told)
+        return maps, {"sky": told}
+
+    def _see_no_sky(self) -> None:
+        """What comes later looks at pictures that have nothing there."""
+        for index, found in enumerate(self.checkpoint.maps()):
+            picture = np.where(found.is_sky, np.float32(-1.0), self.views[index].picture)
+            self.views[index] = replace(self.views[index], picture=picture)
+        self.patches = self.checkpoint.shelves.scratch("patches", len(self.views))
+
     def _completed(self) -> Found:
         maps = self.checkpoint.maps()
         told = {"matched_share": round(_known_share(maps), 4)}
-        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _PLANES_SHARE)
+        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE + _SKY_SHARE, _PLANES_SHARE)
         given = self.views, maps, self.config, on_progress, self.engine
         return completed(*given, self.checkpoint.shelves, self.patches), told
 
     def _stood_up(self) -> Found:
         maps = self.checkpoint.maps()
         told = {"before_walls_share": round(_known_share(maps), 4)}
-        begun = _LOAD_SHARE + _STEREO_SHARE + _PLANES_SHARE
+        begun = _LOAD_SHARE + _STEREO_SHARE + _SKY_SHARE + _PLANES_SHARE
         on_progress = self._progress(begun, _WALLS_SHARE)
         given = self.views, maps, self.config, on_progress, self.engine
         return stood_up(*given, self.checkpoint.shelves, self.patches), told
@@ -237,14 +290,12 @@ def _light(search: _Search, maps: MapShelf) -> tuple[list[Light | None], dict[st
     points = surface_points(views, maps.z)
     if len(points) == 0:
         return nothing, None
-    pictures = search.checkpoint.shelves.scratch("colours", len(views))
-    for index, (image, view) in enumerate(zip(search.images, views, strict=True)):
+    for index in range(len(views)):
         on_progress(0.5 * index / len(views))
-        lens, root = search.capture.cameras[image.camera], ctx.workspace.images_root
-        pictures[index] = undistorted_picture(root, image, lens, _pinhole(view))
+        search.color_picture(index)
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
     light = find_light(
-        views, maps.z, pictures, neighbours, lambda share: on_progress(0.5 + 0.5 * share)
+        views, maps.z, search.colors, neighbours, lambda share: on_progress(0.5 + 0.5 * share)
     )
     level = config.level_light == "on" or light.is_drifting
     told = {
@@ -297,14 +348,19 @@ def _described(maps: MapShelf) -> dict[str, Any]:
 
 
 def _save_picture(path: Path, views: list[StereoView], maps: MapShelf) -> None:
-    """Some of the pictures, their maps below: near is bright, far is dark, grey is unknown."""
+    """Some of the pictures, their maps below: near is bright, far is dark, grey is unknown.
+
+    Sky is black in both.
+    """
     picked = evenly(len(views), _PICTURE_VIEWS)
     height = max(views[index].picture.shape[0] for index in picked)
     columns = []
     for index in picked:
         grey = np.clip(views[index].picture, 0.0, 1.0)[..., None] * np.ones(3) * 255.0
         z = maps[index].z
-        both = (np.rint(grey).astype(np.uint8), depth_picture(z, depth_range(z)))
+        shades = depth_picture(z, depth_range(z))
+        shades[maps[index].is_sky] = 0
+        both = (np.rint(grey).astype(np.uint8), shades)
         padded = [np.pad(item, ((0, height - len(item)), (0, 4), (0, 0))) for item in both]
         columns.append(np.concatenate(padded))
     Image.fromarray(np.concatenate(columns, axis=1)).save(path, quality=88)

@@ -87,17 +87,20 @@ def termination_loss(
     """Penalty on light that does not end where the surface is known to be; a scalar.
 
     -log(sum_i w_i exp(-((m_i - D) / (s D))^2 / 2) + 0.01), mean over the rays with a known distance
-    D, m the midpoints: a surface there is wanted, and nothing is said of rays without one.
-    weights: [R, S]. t_edges: [R, S + 1], scene units. distances: [R], scene units, 0 where unknown.
-    spread: s, relative to D; a tensor where a captured step has to see it change.
+    D, m the midpoints: a surface there is wanted, and nothing is said of rays without one. Where D
+    is infinite there is no surface, and the light that goes through is asked for: 1 - sum_i w_i.
+    weights: [R, S]. t_edges: [R, S + 1], scene units. distances: [R], scene units, 0 where unknown,
+    infinite where nothing stands. spread: s, relative to D; a tensor where a captured step has to
+    see it change.
     After DS-NeRF, arXiv:2107.02791, eq. 7, whose sum of logarithms over samples no ray can fulfil
     with all of them; here the ray's whole light is asked for.
     """
-    known = distances > 0.0
-    safe = torch.where(known, distances, 1.0)[:, None]
+    known, open_sky = distances > 0.0, torch.isinf(distances)
+    safe = torch.where(known & ~open_sky, distances, 1.0)[:, None]
     off = (bin_midpoints(t_edges) - safe) / (safe * spread)
     near = (weights * torch.exp(-0.5 * off.square())).sum(dim=-1)
-    penalty = torch.where(known, -torch.log(near + TERMINATION_FLOOR), 0.0)
+    wanted = torch.where(open_sky, 1.0 - weights.sum(dim=-1), near)
+    penalty = torch.where(known, -torch.log(wanted + TERMINATION_FLOOR), 0.0)
     return penalty.sum() / known.sum().clamp_min(1)
 
 

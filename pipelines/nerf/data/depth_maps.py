@@ -28,8 +28,9 @@ Lens = tuple[float, float, float, float]
 class DepthMaps:
     """N maps, of the training images in their order.
 
-    z: [1 + P] float32, depth along the camera's axis in scene units, 0 where unknown; first one 0
-        for pixels outside of every map, then map after map, row by row.
+    z: [1 + P] float32, depth along the camera's axis in scene units, 0 where unknown, infinite
+        where nothing stands; first one 0 for pixels outside of every map, then map after map, row
+        by row.
     starts: [N] int64, each map's first row in `z`. sizes: [N, 2] int64, width and height.
     lenses: [N, 4] float32: fx, fy, cx, cy in px.
     """
@@ -43,9 +44,9 @@ class DepthMaps:
     def from_arrays(
         cls, maps: Sequence[NDArray[np.float32]], lenses: Sequence[Lens], scale: float
     ) -> DepthMaps:
-        """maps: [H, W] each, world units, 0 where unknown; lenses: fx, fy, cx, cy of each, px.
+        """maps: [H, W] each, world units, 0 where unknown, infinite where nothing stands.
 
-        scale: scene units per world unit.
+        lenses: fx, fy, cx, cy of each, px. scale: scene units per world unit.
         """
         counts = torch.tensor([item.size for item in maps], dtype=torch.int64)
         flat = np.concatenate([np.zeros(1, np.float32), *(item.reshape(-1) for item in maps)])
@@ -61,7 +62,7 @@ class DepthMaps:
 
     @property
     def num_known(self) -> int:
-        """Pixels with a depth."""
+        """Pixels with a depth, be it infinite."""
         return int((self.z > 0).sum())
 
     def to(self, device: torch.device | str) -> DepthMaps:
@@ -69,7 +70,8 @@ class DepthMaps:
         return DepthMaps(*(item.to(device) for item in vars(self).values()))
 
     def distances(self, rays: Rays, cameras: Cameras) -> Tensor:
-        """How far along each ray its image's map says the surface is, [R] scene units, 0 unknown.
+        """How far along each ray its image's map says the surface is, [R] scene units, 0 unknown,
+        infinite where there is none.
 
         rays: as `Cameras.generate_rays` makes them of these N cameras. The pixel that the ray
         passes through tells; nothing is made up between two.

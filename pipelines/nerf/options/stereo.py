@@ -43,6 +43,11 @@ class StereoConfig:
     agree_within: float = option(
         0.02, "Relative difference in depth up to which two views agree.", ge=1e-4, le=0.5
     )
+    find_sky: bool = option(
+        True,
+        "Tell the sky from what stands before it, where things before a far background are seen "
+        "against it: it has no depth, and training lets light through there.",
+    )
     complete_planes: bool = option(
         True,
         "Lay patches of even brightness on the planes that all views together show, where at least "

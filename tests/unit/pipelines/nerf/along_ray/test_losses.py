@@ -236,6 +236,22 @@ def test_termination_loss_equals_the_loop_and_leaves_unknown_rays_alone() -> Non
     )
 
 
+def test_termination_loss_of_the_sky_asks_for_the_light_that_goes_through() -> None:
+    edges, weights = _histogram(3, 9, seed=4)
+    weights = (weights * torch.tensor([[0.3], [1.0], [0.6]], dtype=torch.float64)).requires_grad_()
+    t_edges = 0.5 + 3.0 * edges
+    distances = torch.tensor([torch.inf, torch.inf, 0.0], dtype=torch.float64)
+    loss = termination_loss(weights, t_edges, distances, 0.1)
+    wanted = -(math.log(0.7 + 0.01) + math.log(0.01)) / 2
+    assert float(loss.detach()) == pytest.approx(wanted, rel=1e-9)
+    (gradient,) = torch.autograd.grad(loss, weights)
+    assert torch.isfinite(gradient).all()
+    # Light is to go through all of the ray, wherever it ends now.
+    assert (gradient[0] > 0).all()
+    assert torch.allclose(gradient[0], gradient[0, :1])
+    assert not gradient[2].any()
+
+
 def test_termination_loss_of_rays_without_any_depth_is_nothing() -> None:
     edges, weights = _histogram(3, 4, seed=5)
     weights.requires_grad_()

@@ -1,0 +1,116 @@
+"""The sky is told from what stands before it, and from what only looks like it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.maps import SKY, DepthMap, MapShelf
+from pipelines.nerf.stereo.sky import Sky, find_sky, without
+from tests.unit.pipelines.nerf.stereo.monument import (
+    NUM_VIEWS,
+    ON_PILLAR,
+    SKY_COLOR,
+    UP,
+    Seen,
+    walk_round,
+)
+
+NO_POINTS = np.zeros((0, 3))
+CONFIG = StereoConfig(num_neighbours=4)
+
+
+def sky_of(seen: list[Seen], points: np.ndarray = NO_POINTS, up: np.ndarray = UP) -> Sky:
+    views, depths = [one.view for one in seen], [one.known().z for one in seen]
+    return find_sky(views, lambda index: seen[index].picture, depths, up, points)
+
+
+@pytest.mark.parametrize("color", [SKY_COLOR, (1.0, 1.0, 1.0), (0.45, 0.65, 0.95)])
+def test_all_of_the_sky_is_found_and_nothing_else(color: tuple[float, float, float]) -> None:
+    seen = walk_round(sky=color)
+    found = sky_of(seen)
+    assert found.num_views == NUM_VIEWS
+    assert found.far == 1.0
+    for one, mask in zip(seen, found.masks, strict=True):
+        assert one.is_sky.mean() > 0.2
+        assert mask[one.is_sky].mean() > 0.97
+        assert mask[~one.is_sky].mean() < 0.01
+
+
+def test_a_white_wall_close_behind_is_no_sky() -> None:
+    """The same pictures; what their upper parts border on is not far."""
+    found = sky_of(walk_round(houses=7.0))
+    assert found.num_views == NUM_VIEWS
+    assert found.far == 0.0
+    assert found.share == 0.0
+    assert not any(mask.any() for mask in found.masks)
+
+
+@pytest.mark.parametrize("color", [(0.98, 0.92, 0.85), (0.6, 0.6, 0.6), (0.2, 0.25, 0.95)])
+def test_what_is_warm_or_dark_or_too_colourful_is_no_sky(
+    color: tuple[float, float, float],
+) -> None:
+    assert sky_of(walk_round(sky=color)).num_views == 0
+
+
+def test_what_lies_below_the_horizon_is_no_sky() -> None:
+    assert sky_of(walk_round(), up=-UP).num_views == 0
+
+
+def test_where_there_are_points_there_is_no_sky() -> None:
+    seen = walk_round()
+    rng = np.random.default_rng(0)
+    away = rng.normal(size=(20000, 3))
+    points = 9.0 * away / np.linalg.norm(away, axis=1, keepdims=True)
+    assert sky_of(seen, points).num_views == 0
+    assert sky_of(seen, points[points[:, 2] < 0]).share > 0.2
+
+
+def test_few_pictures_that_may_show_sky_are_not_enough() -> None:
+    seen = walk_round()
+    dark = [
+        dataclasses.replace(one, picture=np.where(one.is_sky[..., None], 90, one.picture))
+        for one in seen
+    ]
+    found = sky_of(seen[:2] + dark[2:])
+    assert found.num_views == 2
+    assert found.share == 0.0
+
+
+def test_nothing_is_left_where_the_sky_is_and_the_rest_stays() -> None:
+    seen = walk_round()
+    maps = MapShelf.of([one.known() for one in seen])
+    left = without(sky_of(seen), [one.view for one in seen], maps, CONFIG)
+    for one, before, found in zip(seen, maps, left, strict=True):
+        assert (before.z[one.is_sky] > 0).mean() > 0.5
+        assert (found.z[one.is_sky] > 0).mean() < 0.03
+        assert found.is_sky[one.is_sky].mean() > 0.85
+        assert not found.is_sky[~one.is_sky].any()
+        on_pillar = one.what == ON_PILLAR
+        same = (found.z == before.z) & (found.votes == before.votes)
+        assert same[on_pillar].mean() > 0.97
+        assert ((found.votes == SKY) == found.is_sky).all()
+
+
+def test_a_sheet_before_the_sky_that_others_see_goes_too() -> None:
+    """One picture's sky was not told, since a gull's colour was on it; its neighbours' was."""
+    seen = walk_round()
+    maps = MapShelf.of([one.known() for one in seen])
+    found = sky_of(seen)
+    masks = [found.masks[0] & False, *found.masks[1:]]
+    views = [one.view for one in seen]
+    left = without(dataclasses.replace(found, masks=masks), views, maps, CONFIG)
+    sheet = seen[0].is_sky & (maps[0].z > 0)
+    assert sheet.sum() > 1000
+    assert (left[0].z[sheet] > 0).mean() < 0.3
+    on_pillar = seen[0].what == ON_PILLAR
+    assert (left[0].z[on_pillar] > 0).mean() > 0.9
+
+
+def test_sky_is_no_depth() -> None:
+    z = np.array([[0.0, 2.0, 0.0]], np.float32)
+    found = DepthMap(z, np.array([[SKY, SKY, 0]], np.uint8))
+    assert found.is_sky.tolist() == [[True, False, False]]
