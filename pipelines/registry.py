@@ -89,7 +89,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="depth",
-        version=8,
+        version=9,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.depth:run",
@@ -114,7 +114,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="train",
-        version=6,
+        version=7,
         after=("depth",),
         reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.train:run",
@@ -144,7 +144,7 @@ STAGES: tuple[Stage, ...] = (
     *(_export_stage(export) for export in EXPORTS),
     Stage(
         name="assess",
-        version=5,
+        version=6,
         after=("evaluate", "pointcloud", "mesh"),
         reads=("ingest", "frames", "poses", "depth", "train", "evaluate", "pointcloud", "mesh"),
         run="pipelines.stages.assess:run",

@@ -49,7 +49,8 @@ class Shell:
 @dataclass(frozen=True)
 class Subject:
     """What may have finer voxels. max_distance: in camera distances. pixel: what one of the fused
-    views covers at distance 1. views: some of them, small ones will do.
+    views covers at distance 1: no voxel is smaller than that at its shell's rim. views: some of
+    them, small ones will do.
     """
 
     max_distance: float
@@ -73,6 +74,9 @@ def find_shells(
     if inner is None:
         return []
     voxel, reach = inner.longest_side / resolution, max_distance
+    if subject is not None:
+        # Finer ones would hold what one view alone shows, and two have to agree.
+        voxel = max(voxel, subject.pixel * inner.distance * max_distance)
     shells = [Shell(inner, voxel)]
     if subject is not None and 0.0 < subject.max_distance < max_distance:
         bounds = bounds_at(subject.max_distance)

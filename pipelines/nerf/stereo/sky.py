@@ -13,10 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from skimage.morphology import dilation, erosion
+from skimage.segmentation import expand_labels
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
@@ -39,8 +41,10 @@ _BORDER_PX = 2
 _MOST_SPREAD, _LEAST_BRIGHT, _LEAST_EACH, _MOST_WARM = 0.06, 0.8, 0.3, 0.03
 """Of colours in [0, 1]: standard deviation; the mean of the brightest channel and of each; and how
 much more red than blue."""
-_ALIKE = 0.08
-_HORIZON_DEG, _LOW_PERCENT = 0.0, 5
+_ALIKE, _FRINGE_PX = 0.08, 4
+"""Two colours are alike; pixels so near to a patch of sky that have its colour are sky, too."""
+_HORIZON_DEG, _LOW_PERCENT = -3.0, 5
+"""All but so few pixels of a patch are above the horizon, which is known to some degrees."""
 _MOST_POINTS, _POINTS_INSIDE_PX = 1e-3, 4
 """Points of structure from motion, per pixel of what is so far inside a patch."""
 _RING_FROM_PX, _RING_TO_PX = 3, 12
@@ -48,7 +52,7 @@ _FAR, _FAR_PERCENT, _LEAST_FAR = 3.0, 90, 0.3
 """In that share of the views a tenth of what is known around their patches is so many times as far
 as the median of all that they know. Not more of it: patches' own wrong depths lie there, too."""
 _LEAST_VIEWS = 3
-_RIM_PX = 2
+_RIM_PX = 1
 """Pixels of a patch so near to its border may show what stands before the sky."""
 _BEHIND_ALL = 1e3
 """How far the sky is to be thought of, in the largest depth that is known."""
@@ -140,7 +144,12 @@ def like_sky(
     apart = np.abs(mean[:, None] - mean[None, sure]).max(axis=-1).min(axis=-1)
     also = looks & (apart <= _ALIKE) & (lowest >= lowest[sure].min())
     found: Bools = (sure | also)[labels] & there
-    return found
+    # Patches end before the things that they surround do.
+    expand: Any = expand_labels
+    own = expand(np.where(found, labels + 1, 0), _FRINGE_PX)
+    off = np.abs(picture / 255.0 - mean[np.maximum(own - 1, 0)]).max(axis=-1)
+    fringed: Bools = found | (there & (own > 0) & (off <= _ALIKE))
+    return fringed
 
 
 def _elevation(view: StereoView, up: Floats) -> Floats:
@@ -177,7 +186,9 @@ def _grown(mask: Bools, radius: int) -> Bools:
 
 def _shrunk(mask: Bools, radius: int) -> Bools:
     """Without what is so near to its border; the picture's own is none."""
-    return ~_grown(~mask, radius)
+    padded = np.pad(~mask, radius, mode="edge")
+    shrunk: Bools = ~_grown(padded, radius)[radius:-radius, radius:-radius]
+    return shrunk
 
 
 def without(

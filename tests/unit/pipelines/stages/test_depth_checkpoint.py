@@ -13,6 +13,7 @@ from PIL import Image
 from pipelines.errors import Cancelled
 from pipelines.manifest import RunHooks
 from pipelines.nerf.stereo.engines import KernelEngine
+from pipelines.sample.scenes import monument
 from pipelines.stages import depth_checkpoint
 from pipelines.workspace import MANIFEST, Workspace
 from tests.unit.pipelines.stages import tiny_job
@@ -46,7 +47,9 @@ def capture(root: Path) -> Workspace:
     return tiny_job.make_capture(root / "job", NUM_IMAGES)
 
 
-def cut_short(workspace: Workspace, at: str, **more: Any) -> list[str]:
+def cut_short(
+    workspace: Workspace, at: str, options: dict[str, Any] = OPTIONS, **more: Any
+) -> list[str]:
     """Run until a cancel is noticed, which comes with a message. The messages so far."""
     messages: list[str] = []
     hooks = RunHooks(
@@ -55,7 +58,7 @@ def cut_short(workspace: Workspace, at: str, **more: Any) -> list[str]:
         **more,
     )
     with pytest.raises(Cancelled):
-        tiny_job.run_with(workspace, "depth", hooks, **OPTIONS)
+        tiny_job.run_with(workspace, "depth", hooks, **options)
     assert not workspace.stage("depth").exists()
     return messages
 
@@ -193,3 +196,18 @@ def test_it_is_offered_by_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         tiny_job.run_with(capture(tmp_path / str(seconds)), "depth", hooks, **OPTIONS)
         assert len(offered) - before == 0 or seconds == 0.0
     assert len(offered) > NUM_VIEWS
+
+
+@pytest.mark.parametrize("at", ["looking for the sky", "completing plain surfaces"])
+def test_a_sky_that_was_found_stays_found(tmp_path: Path, at: str) -> None:
+    """The passes behind it see pictures without it, after a cut as well."""
+
+    def outdoors(name: str) -> Workspace:
+        return tiny_job.make_capture(tmp_path / name, NUM_IMAGES, monument.TAKE, 128)
+
+    options = OPTIONS | {"long_side_px": 128, "num_planes": 64}
+    whole = tiny_job.run(outdoors("whole"), "depth", **options)
+    assert whole["summary"]["sky"]["share"] > 0.2
+    workspace = outdoors("cut")
+    cut_short(workspace, at, options)
+    assert same_bytes(tiny_job.run(workspace, "depth", **options), whole)

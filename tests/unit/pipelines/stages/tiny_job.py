@@ -13,7 +13,8 @@ from pipelines.captures.record import CaptureRecord
 from pipelines.manifest import RunHooks, run_stage
 from pipelines.options import resolve_options
 from pipelines.registry import get_stage
-from pipelines.sample.film import phone_camera, render_all, walk
+from pipelines.sample.film import SAMPLE_TAKE, phone_camera, render_all, walk
+from pipelines.sample.takes import Take
 from pipelines.workspace import MANIFEST, Workspace
 
 NUM_IMAGES = 20
@@ -52,14 +53,20 @@ def options_of(stage: str, **changes: Any) -> dict[str, Any]:
     return resolve_options("preview", overrides)[stage]
 
 
-def make_capture(root: Path, num_images: int = NUM_IMAGES) -> Workspace:
+def make_capture(
+    root: Path,
+    num_images: int = NUM_IMAGES,
+    take: Take = SAMPLE_TAKE,
+    long_side_px: int = LONG_SIDE,
+) -> Workspace:
     """A posed capture as `ingest` leaves it, with a manifest that says that it is complete."""
     workspace = Workspace(root)
     folder = workspace.stage("ingest")
     (folder / "images").mkdir(parents=True)
-    truth = walk(max(num_images, 2), phone_camera(LONG_SIDE))
+    truth = walk(max(num_images, 2), phone_camera(long_side_px), take=take)
+    pictures = render_all(truth, 1, take)
     images = []
-    for image, picture in zip(truth.images[:num_images], render_all(truth, 1), strict=False):
+    for image, picture in zip(truth.images[:num_images], pictures, strict=False):
         file = f"images/{image.file}.png"
         Image.fromarray(picture).save(folder / file)
         images.append(dataclasses.replace(image, file=file))

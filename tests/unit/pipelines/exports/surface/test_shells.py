@@ -83,14 +83,26 @@ def test_the_subject_has_voxels_half_as_large(views: ViewStore) -> None:
     assert all(shell.is_far for shell in fine[2:])
 
 
-def test_no_voxel_is_much_smaller_than_a_pixel(views: ViewStore) -> None:
+def test_no_voxel_is_smaller_than_a_pixel_at_its_shells_rim(views: ViewStore) -> None:
     plain = shells_of(views, 12.0)
     distance = plain[0].bounds.distance
-    pixel = 0.7 * plain[0].voxel
-    fine = shells_of(views, 12.0, fine_distance=1.0, pixel=pixel / distance)
-    assert fine[0].voxel == pytest.approx(pixel)
-    hardly = shells_of(views, 12.0, fine_distance=1.0, pixel=0.9 * plain[0].voxel / distance)
-    assert [shell.voxel for shell in hardly] == [shell.voxel for shell in plain]
+    small = shells_of(views, 12.0, fine_distance=1.0, pixel=0.6 * plain[0].voxel / distance)
+    assert small[0].voxel == pytest.approx(0.6 * plain[0].voxel)
+    assert [shell.voxel for shell in small[1:]] == [shell.voxel for shell in plain]
+    large = 1.1 * plain[0].voxel
+    coarse = shells_of(views, 12.0, fine_distance=1.0, pixel=large / distance)
+    assert coarse[0].voxel == pytest.approx(large)
+    assert coarse[1].voxel == pytest.approx(1.5 * large)
+    assert coarse[-1].voxel == pytest.approx(12.0 * large)
+
+
+def test_a_subject_hardly_finer_than_its_surroundings_needs_no_shell(views: ViewStore) -> None:
+    plain = shells_of(views, 12.0)
+    pixel = 0.9 * plain[0].voxel / plain[0].bounds.distance
+    found = shells_of(views, 12.0, fine_distance=1.3, pixel=pixel / 1.3)
+    assert len(found) == len(plain) + 1
+    found = shells_of(views, 12.0, fine_distance=0.0, pixel=pixel)
+    assert len(found) == len(plain)
 
 
 def test_a_room_has_no_subject(views: ViewStore) -> None:
