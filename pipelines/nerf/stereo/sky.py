@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 _LEAST_AREA = 0.005
 """Of the picture. Smaller patches, and what the picture's border does not touch, are sky where they
 look like a patch of it that is found, and are as high."""
-_BORDER_PX = 2
+_BORDER_PX = 6
 _MOST_SPREAD, _LEAST_BRIGHT, _LEAST_EACH, _MOST_WARM = 0.06, 0.8, 0.3, 0.03
 """Of colours in [0, 1]: standard deviation; the mean of the brightest channel and of each; and how
 much more red than blue."""
@@ -46,7 +46,8 @@ _ALIKE, _FRINGE_PX = 0.08, 4
 _HORIZON_DEG, _LOW_PERCENT = -3.0, 5
 """All but so few pixels of a patch are above the horizon, which is known to some degrees."""
 _MOST_POINTS, _POINTS_INSIDE_PX = 1e-3, 4
-"""Points of structure from motion, per pixel of what is so far inside a patch."""
+"""Points of structure from motion, a few of which are always wrong, per pixel of what is so far
+inside a patch."""
 _RING_FROM_PX, _RING_TO_PX = 3, 12
 _FAR, _FAR_PERCENT, _LEAST_FAR = 3.0, 90, 0.3
 """In that share of the views a tenth of what is known around their patches is so many times as far

@@ -20,7 +20,7 @@ from pipelines.exports.texture.photos import Photos
 from pipelines.manifest import RunHooks
 from pipelines.nerf.data.light import exposed
 from pipelines.nerf.stereo.engines import TorchEngine
-from pipelines.options import OptionsError, resolve_options
+from pipelines.options import AssessOptions, OptionsError, resolve_options
 from pipelines.sample.scene import depth_image, pose_matrix
 from pipelines.sample.scenes import monument
 from pipelines.scene.cameras_file import CamerasFile
@@ -29,6 +29,7 @@ from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.stereo_views import undistorted_picture
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stages import depth
+from pipelines.stages.assess import load_views
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -260,9 +261,30 @@ def test_a_room_has_no_sky(mapped: Workspace) -> None:
     assert mapped.manifest("depth")["summary"]["sky"]["share"] == 0.0
 
 
-def test_training_lets_light_through_where_the_sky_is(outdoors: Workspace) -> None:
+@pytest.fixture(scope="module")
+def trained_outdoors(outdoors: Workspace) -> Workspace:
     tiny_job.run(outdoors, "train")
-    scene = TrainedScene.load(outdoors.stage("train") / "model.zip")
+    return outdoors
+
+
+def test_the_sky_of_held_out_photos_is_no_hole(trained_outdoors: Workspace) -> None:
+    views = load_views(trained_outdoors, AssessOptions(long_side_px=64))
+    assert views.held_out
+    assert views.sky is not None
+    lens = views.posed[0].camera
+    camera = CamerasFile.load(trained_outdoors.stage("ingest") / "cameras.json").cameras[lens]
+    for index, image in enumerate(views.posed):
+        small = Pinhole.of(camera, 64).intrinsics()
+        exact = depth_image(small, pose_matrix(image), monument.SCENE)
+        valid = views.valid(index)
+        assert valid is not None
+        assert valid.shape == exact.shape
+        assert valid[exact == 0].mean() < 0.15
+        assert valid[exact > 0].mean() > 0.97
+
+
+def test_training_lets_light_through_where_the_sky_is(trained_outdoors: Workspace) -> None:
+    scene = TrainedScene.load(trained_outdoors.stage("train") / "model.zip")
     image = scene.training_images()[5]
     lens = Pinhole.of(scene.lens_of(image), 64)
     pose = np.asarray(image.world_from_camera, np.float64)
