@@ -207,19 +207,20 @@ def without(
     """
     open_sky = [_shrunk(mask, _RIM_PX) for mask in sky.masks]
     cleared = shelves.scratch("without sky", len(views))
-    beyond = shelves.scratch("sky far away", len(views))
-    farthest = _BEHIND_ALL * max(float(z.max(initial=0.0)) for z in maps.z)
+    beyond = shelves.scratch("sky alone", len(views))
+    farthest = np.float32(_BEHIND_ALL * max(float(z.max(initial=0.0)) for z in maps.z))
     for index, z in enumerate(maps.z):
         cleared[index] = np.where(sky.masks[index], np.float32(0.0), z)
-        beyond[index] = np.where(open_sky[index], np.float32(farthest), cleared[index])
+        beyond[index] = np.where(open_sky[index], farthest, np.float32(0.0))
     seen = surface_points(views, cleared)
     neighbours = choose_neighbours(views, seen, config.num_neighbours, config.best_angle_deg)
     kept = MapShelf.kept(shelves, "sky", len(views), fresh=True)
     for index in range(len(views)):
-        votes, _ = votes_of_others(
-            cleared[index], index, views, beyond, neighbours[index], config, engine
-        )
-        stays = (cleared[index] > 0) & (votes[SEE_THROUGH] <= votes[AGREE])
+        given = index, views, cleared, neighbours[index], config, engine
+        agree = votes_of_others(cleared[index], *given)[0][AGREE]
+        given = index, views, beyond, neighbours[index], config, engine
+        through = votes_of_others(cleared[index], *given)[0][SEE_THROUGH]
+        stays = (cleared[index] > 0) & (through <= agree)
         told = np.where(stays, maps[index].votes, 0)
         kept[index] = DepthMap(
             np.where(stays, cleared[index], np.float32(0.0)),
