@@ -235,6 +235,7 @@ class _Search:
             maps.z,
             find_up(poses)[0],
             np.zeros((0, 3)) if points is None else points,
+            None if self.source == "stereo" else self._sensed(),
             self.patches,
             half_done(0.0),
         )

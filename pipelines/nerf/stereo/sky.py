@@ -52,7 +52,7 @@ _RING_FROM_PX, _RING_TO_PX = 3, 12
 _FAR, _FAR_PERCENT, _LEAST_FAR = 3.0, 90, 0.3
 """In that share of the views a tenth of what is known around their patches is so many times as far
 as the median of all that they know. Not more of it: patches' own wrong depths lie there, too."""
-_LEAST_VIEWS = 3
+_LEAST_VIEWS, _MOST_MEASURED = 3, 0.2
 _RIM_PX = 1
 """Pixels of a patch so near to its border may show what stands before the sky."""
 _BEHIND_ALL = 1e3
@@ -79,6 +79,7 @@ def find_sky(
     depths: ByView[NDArray[np.float32]],
     up: Floats,
     points: Floats,
+    measured: Sequence[NDArray[np.float32] | None] | None = None,
     patches: Shelf | None = None,
     on_share: Callable[[float], None] = lambda done: None,
 ) -> Sky:
@@ -86,10 +87,11 @@ def find_sky(
 
     picture_of: each view's, in colour, [H, W, 3] uint8, sRGB. depths: what is known so far, wrong
     where the sky is. up: [3], unit. points: [P, 3], world, on what was told apart from anything
-    else. patches: a shelf for the pictures' `patches_of`, or with them. on_share: told the share
+    else. measured: what a sensor saw, as `depths`, None for a view without; of the sky it sees
+    nothing. patches: a shelf for the pictures' `patches_of`, or with them. on_share: told the share
     that is done; may raise.
     """
-    found, is_far = [], []
+    found, is_far, is_measured = [], [], [np.zeros(0, np.bool_)]
     for index, view in enumerate(views):
         if patches is not None and not patches.has(index):
             patches[index] = patches_of(view.picture)
@@ -100,11 +102,16 @@ def find_sky(
             ring = _grown(mask, _RING_TO_PX) & ~_grown(mask, _RING_FROM_PX) & (z > 0)
             farthest = np.percentile(z[ring], _FAR_PERCENT) if ring.any() else 0.0
             is_far.append(bool(farthest >= _FAR * np.median(z[z > 0])))
+        seen = None if measured is None else measured[index]
+        if seen is not None:
+            is_measured.append(seen[mask] > 0)
         found.append(mask)
         on_share((index + 1) / len(views))
     far = float(np.mean(is_far)) if is_far else 0.0
     num_views = sum(bool(mask.any()) for mask in found)
-    if num_views < _LEAST_VIEWS or far < _LEAST_FAR:
+    known_to_sensor = np.concatenate(is_measured)
+    is_near = len(known_to_sensor) > 0 and bool(known_to_sensor.mean() > _MOST_MEASURED)
+    if num_views < _LEAST_VIEWS or far < _LEAST_FAR or is_near:
         found = [np.zeros_like(mask) for mask in found]
     return Sky(found, float(np.mean([mask.mean() for mask in found])), num_views, far)
 

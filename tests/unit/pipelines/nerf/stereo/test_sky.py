@@ -69,6 +69,18 @@ def test_where_there_are_points_there_is_no_sky() -> None:
     assert sky_of(seen, points[points[:, 2] < 0]).share > 0.2
 
 
+def test_what_a_sensor_measures_is_no_sky() -> None:
+    """A white hall, high above: a sensor sees its ceiling, but nothing of a sky."""
+    seen = walk_round()
+    given = [one.view for one in seen], lambda index: seen[index].picture
+    depths = [one.known().z for one in seen]
+    hall = [np.where(one.is_sky, np.float32(9.0), one.depth) for one in seen]
+    outdoors: list[np.ndarray | None] = [one.depth for one in seen]
+    assert find_sky(*given, depths, UP, NO_POINTS, hall).share == 0.0
+    assert find_sky(*given, depths, UP, NO_POINTS, outdoors).share > 0.2
+    assert find_sky(*given, depths, UP, NO_POINTS, [None] * len(seen)).share > 0.2
+
+
 def test_few_pictures_that_may_show_sky_are_not_enough() -> None:
     seen = walk_round()
     dark = [
