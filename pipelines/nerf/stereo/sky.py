@@ -52,7 +52,8 @@ _RING_FROM_PX, _RING_TO_PX = 3, 12
 _FAR, _FAR_PERCENT, _LEAST_FAR = 3.0, 90, 0.3
 """In that share of the views a tenth of what is known around their patches is so many times as far
 as the median of all that they know. Not more of it: patches' own wrong depths lie there, too."""
-_LEAST_VIEWS, _MOST_MEASURED = 3, 0.2
+_LEAST_VIEWS, _LEAST_SHARE, _MOST_MEASURED = 3, 0.01, 0.2
+"""So many views show it, so much of all pictures is it, and a sensor measures no more of it."""
 _RIM_PX = 1
 """Pixels of a patch so near to its border may show what stands before the sky."""
 _BEHIND_ALL = 1e3
@@ -111,9 +112,11 @@ def find_sky(
     num_views = sum(bool(mask.any()) for mask in found)
     known_to_sensor = np.concatenate(is_measured)
     is_near = len(known_to_sensor) > 0 and bool(known_to_sensor.mean() > _MOST_MEASURED)
-    if num_views < _LEAST_VIEWS or far < _LEAST_FAR or is_near:
-        found = [np.zeros_like(mask) for mask in found]
-    return Sky(found, float(np.mean([mask.mean() for mask in found])), num_views, far)
+    share = float(np.mean([mask.mean() for mask in found]))
+    too_little = num_views < _LEAST_VIEWS or share < _LEAST_SHARE
+    if too_little or far < _LEAST_FAR or is_near:
+        found, share = [np.zeros_like(mask) for mask in found], 0.0
+    return Sky(found, share, num_views, far)
 
 
 def like_sky(
