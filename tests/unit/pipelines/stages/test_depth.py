@@ -243,11 +243,11 @@ def sky_and_known(workspace: Workspace) -> tuple[float, float, float]:
 
 def test_the_sky_has_no_depth(outdoors: Workspace, tmp_path: Path) -> None:
     summary = outdoors.manifest("depth")["summary"]
-    assert summary["sky"]["share"] > 0.1
-    assert summary["sky"]["num_views"] >= 10
+    assert summary["sky"]["share"] > 0.2
+    assert summary["sky"]["num_views"] >= 20
     told, known, wrong = sky_and_known(outdoors)
-    assert told > 0.4
-    assert known < 0.3
+    assert told > 0.8
+    assert known < 0.05
     assert wrong < 0.01
     left = tiny_job.make_capture(tmp_path / "job", 24, monument.TAKE, 128)
     summary = tiny_job.run(left, "depth", **OUTDOORS | {"find_sky": False})["summary"]
