@@ -42,7 +42,9 @@ def _seen_mesh(truth: CamerasFile, scene: Scene) -> tuple[Floats, NDArray[np.int
         vertices.append(origins + t[:, None] * directions)
         index = np.arange(z.size).reshape(z.shape)
         corners = np.stack([index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]], -1)
-        quads = corners[np.ptp(z.ravel()[corners], axis=-1) < 0.05]
+        # From farther away a pixel is a longer step on what is seen at a glance.
+        most = np.maximum(0.05, 0.03 * z.ravel()[corners].mean(axis=-1))
+        quads = corners[np.ptp(z.ravel()[corners], axis=-1) < most]
         faces += [offset + quads[:, [0, 1, 2]], offset + quads[:, [2, 1, 3]]]
         offset += z.size
     return np.concatenate(vertices), np.concatenate(faces)
