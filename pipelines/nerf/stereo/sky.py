@@ -129,18 +129,14 @@ def like_sky(
     there = view.picture >= 0.0
     labels = even_patches(view.picture, patches)
     num = int(labels.max()) + 1
-    flat = labels[there]
-    area = np.bincount(flat, minlength=num)
-    filled = np.maximum(area, 1)
-    colors = picture[there] / 255.0
-    mean = np.stack([np.bincount(flat, c, num) / filled for c in colors.T], axis=-1)
-    square = np.stack([np.bincount(flat, c * c, num) / filled for c in colors.T], axis=-1)
-    spread = np.sqrt(np.maximum(square - mean**2, 0.0)).max(axis=-1)
+    area = np.bincount(labels[there], minlength=num)
     inside = there & (_shrunk_labels(labels) == labels)
-    rows_columns = view.seen_at(points)[1:]
-    hit = inside[rows_columns]
-    num_points = np.bincount(labels[rows_columns][hit], minlength=num)
     pixels = np.bincount(labels[inside], minlength=num)
+    # What stands before a patch frays into it: its colours are those of its inside, if it has one.
+    told = inside | (there & (pixels == 0)[labels])
+    mean, spread = _colors_of(labels[told], picture[told], num)
+    rows_columns = view.seen_at(points)[1:]
+    num_points = np.bincount(labels[rows_columns][inside[rows_columns]], minlength=num)
     looks = (spread <= _MOST_SPREAD) & (mean.max(axis=-1) >= _LEAST_BRIGHT)
     looks &= (mean.min(axis=-1) >= _LEAST_EACH) & (mean[:, 0] - mean[:, 2] <= _MOST_WARM)
     looks &= (area > 0) & (num_points <= _MOST_POINTS * pixels)
@@ -161,6 +157,18 @@ def like_sky(
     off = np.abs(picture / 255.0 - mean[np.maximum(own - 1, 0)]).max(axis=-1)
     fringed: Bools = found | (there & (own > 0) & (off <= _ALIKE))
     return fringed
+
+
+def _colors_of(labels: Labels, colors: Bytes, num: int) -> tuple[Floats, Floats]:
+    """Mean colour [num, 3] in [0, 1] of each patch, and the largest standard deviation [num].
+
+    labels: [K]. colors: [K, 3], sRGB.
+    """
+    count = np.maximum(np.bincount(labels, minlength=num), 1)
+    channels = (colors / 255.0).T
+    mean = np.stack([np.bincount(labels, c, num) / count for c in channels], axis=-1)
+    square = np.stack([np.bincount(labels, c * c, num) / count for c in channels], axis=-1)
+    return mean, np.sqrt(np.maximum(square - mean**2, 0.0)).max(axis=-1)
 
 
 def _elevation(view: StereoView, up: Floats) -> Floats:

@@ -92,6 +92,21 @@ def test_few_pictures_that_may_show_sky_are_not_enough() -> None:
     assert found.share == 0.0
 
 
+def test_dark_twigs_at_its_border_make_it_no_less_sky() -> None:
+    """A patch takes some of what it surrounds; its inside is what tells its colour."""
+    rng = np.random.default_rng(0)
+    seen = []
+    for one in walk_round():
+        rim = one.is_sky & ~np.roll(one.is_sky, -2, axis=0) & (rng.random(one.is_sky.shape) < 0.8)
+        picture = np.where(rim[..., None], np.uint8(10), one.picture)
+        assert np.std(picture[one.is_sky] / 255.0) > 0.06
+        seen.append(dataclasses.replace(one, picture=picture))
+    found = sky_of(seen)
+    assert found.num_views == NUM_VIEWS
+    for one, mask in zip(seen, found.masks, strict=True):
+        assert mask[one.is_sky].mean() > 0.95
+
+
 def test_nothing_is_left_where_the_sky_is_and_the_rest_stays() -> None:
     seen = walk_round()
     maps = MapShelf.of([one.known() for one in seen])
