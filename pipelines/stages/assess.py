@@ -82,13 +82,15 @@ class Views:
         return photo
 
     def valid(self, index: int) -> NDArray[np.bool_] | None:
-        """[H, W], or None where all of it counts. The sky does not: nothing is to be there."""
+        """[H, W], or None where all of it counts. The sky does not, as nothing is to be there, but
+        in a photo that shows nothing else.
+        """
         mask = self.images.mask(index)
         valid = None if mask is None else mask.numpy()
-        if self.sky is None or self.sky[index].all():
+        if self.sky is None:
             return valid
-        below = ~self.sky[index]
-        return below if valid is None else valid & below
+        below = ~self.sky[index] if valid is None else valid & ~self.sky[index]
+        return below if below.any() else valid
 
     def lit(self, view: AssetView, index: int) -> AssetView:
         """A view of an asset in the light of the photo."""

@@ -283,6 +283,22 @@ def test_the_sky_of_held_out_photos_is_no_hole(trained_outdoors: Workspace) -> N
         assert valid[exact > 0].mean() > 0.97
 
 
+def test_a_photo_of_which_nothing_but_sky_counts_is_looked_at_whole(
+    trained_outdoors: Workspace,
+) -> None:
+    views = load_views(trained_outdoors, AssessOptions(long_side_px=64))
+    height, width = views.photo(0).shape[:2]
+    everywhere = [np.ones((height, width), bool)] * len(views.posed)
+    assert dataclasses.replace(views, sky=everywhere).valid(0) is None
+    upper = np.zeros((height, width), bool)
+    upper[: height // 2] = True
+    every = torch.from_numpy(np.concatenate([upper.ravel()] * len(views.posed)))
+    masked = dataclasses.replace(views.images, valid=every)
+    valid = dataclasses.replace(views, images=masked, sky=[upper] * len(views.posed)).valid(0)
+    assert valid is not None
+    assert (valid == upper).all()
+
+
 def test_training_lets_light_through_where_the_sky_is(trained_outdoors: Workspace) -> None:
     scene = TrainedScene.load(trained_outdoors.stage("train") / "model.zip")
     image = scene.training_images()[5]
