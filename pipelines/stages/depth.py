@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipelines.errors import TrainingError
-from pipelines.exports.formats.ply import read_ply
 from pipelines.exports.shades import depth_picture, depth_range
 from pipelines.nerf.data.images import split_indices
 from pipelines.nerf.data.light import Light
@@ -43,11 +42,11 @@ from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.natural_order import natural_key
-from pipelines.scene.orientation import find_up
 from pipelines.scene.stereo_views import sensor_depth, stereo_view, undistorted_picture
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 from pipelines.stages.depth_checkpoint import DepthCheckpoint, inputs_of
+from pipelines.stages.sky_masks import known_points, up_and_points
 
 _LOAD_SHARE, _STEREO_SHARE, _SKY_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.7, 0.02, 0.1, 0.1
 _LIGHT_SHARE = 0.03
@@ -135,8 +134,8 @@ class _Search:
         patches, colors = (
             checkpoint.shelves.scratch(name, len(views)) for name in ("patches", "colors")
         )
-        told = ctx, capture, images, views, config, source
-        return cls(*told, engine, checkpoint, patches, colors, started)
+        given = ctx, capture, images, views, config, source
+        return cls(*given, engine, checkpoint, patches, colors, started)
 
     @property
     def device(self) -> str:
@@ -183,7 +182,7 @@ class _Search:
 
     def _matched(self) -> Found:
         on_progress = self._progress(_LOAD_SHARE, _STEREO_SHARE)
-        points, shelves = _known_points(self.ctx), self.checkpoint.shelves
+        points, shelves = known_points(self.ctx.workspace), self.checkpoint.shelves
         if self.source == "stereo":
             with_points = self.views, self.config, points, on_progress
             return find_depth_maps(*with_points, self.engine, shelves), {"source": "stereo"}
@@ -222,19 +221,16 @@ class _Search:
 
     def _without_sky(self) -> Found:
         maps, views = self.checkpoint.maps(), self.views
-        points = _known_points(self.ctx)
         on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _SKY_SHARE)
 
         def half_done(begun: float) -> Callable[[float], None]:
             return lambda share: on_progress(begun + 0.5 * share, "looking for the sky")
 
-        poses = np.array([image.world_from_camera for image in self.capture.images], np.float64)
         sky = find_sky(
             views,
             self.color_picture,
             maps.z,
-            find_up(poses)[0],
-            np.zeros((0, 3)) if points is None else points,
+            *up_and_points(self.ctx.workspace, self.capture),
             None if self.source == "stereo" else self._sensed(),
             self.patches,
             half_done(0.0),
@@ -319,13 +315,6 @@ def training_images(ctx: StageContext, split: SplitConfig) -> tuple[CamerasFile,
     with nerf_errors_as(TrainingError):
         trained, _ = split_indices(len(ordered), split)
     return capture, [ordered[index] for index in trained]
-
-
-def _known_points(ctx: StageContext) -> NDArray[np.float64] | None:
-    path = ctx.workspace.sparse_points
-    if not path.is_file():
-        return None
-    return np.asarray(read_ply(path).points, np.float64)
 
 
 def _pinhole(view: StereoView) -> Pinhole:

@@ -19,6 +19,20 @@ from pipelines.scene.stereo_views import stereo_view, undistorted_picture
 from pipelines.workspace import Workspace
 
 Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+
+def known_points(workspace: Workspace) -> Floats | None:
+    """[P, 3], world, of structure from motion; None where there was none."""
+    path = workspace.sparse_points
+    return np.asarray(read_ply(path).points, np.float64) if path.is_file() else None
+
+
+def up_and_points(workspace: Workspace, capture: CamerasFile) -> tuple[Floats, Floats]:
+    """What tells sky from other things: up [3], unit, and `known_points`, none without any."""
+    up, _ = find_up(np.array([image.world_from_camera for image in capture.images], np.float64))
+    points = known_points(workspace)
+    return up, np.zeros((0, 3)) if points is None else points
 
 
 def sky_masks(
@@ -34,9 +48,7 @@ def sky_masks(
     told = made["summary"].get("sky")
     if not told or told["share"] == 0.0:
         return None
-    up, _ = find_up(np.array([image.world_from_camera for image in capture.images], np.float64))
-    path = workspace.sparse_points
-    points = np.asarray(read_ply(path).points, np.float64) if path.is_file() else np.zeros((0, 3))
+    up, points = up_and_points(workspace, capture)
     side, root = made["options"]["long_side_px"], workspace.images_root
     found, lenses = [], []
     for image in images:
