@@ -57,7 +57,8 @@ class MeshOptions(CropOptions, TextureOptions):
         ge=32,
         le=2048,
         description="Voxels along the longest side of what lies within max_distance; fewer where "
-        "memory has no room for so many, which the report tells.",
+        "memory has no room for so many, which the report tells, and where they would be smaller "
+        "than a pixel of the rendered depth at max_distance.",
     )
     fine_distance: float = Field(
         1.0,
