@@ -70,10 +70,15 @@ def stereo_view(root: Path, image: PosedImage, lens: Intrinsics, long_side_px: i
         opened.draft("L", size)
         grey = opened.convert("L").resize(size, Image.Resampling.BOX)
     picture = np.asarray(grey, np.float32) / np.float32(255.0)
+    shown = _undistorted(_unmasked(picture, root, image), lens, pinhole)
+    return view_of(image, pinhole, shown)
+
+
+def view_of(image: PosedImage, pinhole: Pinhole, picture: NDArray[np.float32]) -> StereoView:
+    """The view that such a picture [H, W], of the image's place, is seen in."""
     pose = np.asarray(image.world_from_camera, np.float64)
     turned = np.column_stack([pose[:, :3] @ _OPENCV_AXES, pose[:, 3]])
-    shown = _undistorted(_unmasked(picture, root, image), lens, pinhole)
-    return StereoView(shown, _lengths(pinhole), turned)
+    return StereoView(picture, _lengths(pinhole), turned)
 
 
 def undistorted_picture(

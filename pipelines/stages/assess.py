@@ -50,7 +50,7 @@ from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.scene.trained_scene import nerf_cameras, nerf_errors_as
 from pipelines.stage import StageContext
 from pipelines.stages.evaluate import picture_name
-from pipelines.stages.sky_masks import sky_masks
+from pipelines.stages.void_masks import void_masks
 from pipelines.workspace import Workspace
 
 NO_AGREED_DEPTH = "This job made no depth maps that views agree on."
@@ -65,7 +65,7 @@ class Views:
 
     cameras: in `frame`, the world less its origin. held_out: whether training never saw them.
     bend: of the camera's curve, where assets have the mean light, which each photo differs from.
-    sky: [H, W] of each photo, where it shows the sky; None in captures without any.
+    void: [H, W] of each photo, where nothing stands; None in captures without sky and dark.
     """
 
     posed: list[PosedImage]
@@ -74,7 +74,7 @@ class Views:
     frame: SceneTransform
     held_out: bool
     bend: float | None = None
-    sky: list[NDArray[np.bool_]] | None = None
+    void: list[NDArray[np.bool_]] | None = None
 
     def photo(self, index: int) -> NDArray[np.float32]:
         """[H, W, 3] in [0, 1]."""
@@ -82,15 +82,15 @@ class Views:
         return photo
 
     def valid(self, index: int) -> NDArray[np.bool_] | None:
-        """[H, W], or None where all of it counts. The sky does not, as nothing is to be there, but
-        in a photo that shows nothing else.
+        """[H, W], or None where all of it counts. The sky and the dark do not, as nothing is to be
+        there, but in a photo that shows nothing else.
         """
         mask = self.images.mask(index)
         valid = None if mask is None else mask.numpy()
-        if self.sky is None:
+        if self.void is None:
             return valid
-        below = ~self.sky[index] if valid is None else valid & ~self.sky[index]
-        return below if below.any() else valid
+        solid = ~self.void[index] if valid is None else valid & ~self.void[index]
+        return solid if solid.any() else valid
 
     def lit(self, view: AssetView, index: int) -> AssetView:
         """A view of an asset in the light of the photo."""
@@ -132,7 +132,7 @@ def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
         "depth": depth,
         "depth_reason": no_depth,
         "depth_inconsistency": floaters,
-        "sky": _before_sky(seen.views, views),
+        "void": _before_void(seen.views, views),
         "warnings": [] if warning is None else [warning],
         "definitions": DEFINITIONS,
         "per_view": [
@@ -171,8 +171,8 @@ def load_views(workspace: Workspace, options: AssessOptions) -> Views:
         )
         lenses = [cameras.cameras[image.camera] for image in posed]
         sized = nerf_cameras(lenses, poses, frame).resized(options.long_side_px)
-    sky = sky_masks(workspace, cameras, posed, sized)
-    return Views(posed, images, sized, frame, bool(held_out), cameras.bend, sky)
+    void = void_masks(workspace, cameras, posed, sized)
+    return Views(posed, images, sized, frame, bool(held_out), cameras.bend, void)
 
 
 def describe(views: Views) -> dict[str, Any]:
@@ -244,15 +244,17 @@ def _look_at_cloud(
     return rows, round(float(np.median(spacing)), 6)
 
 
-def _before_sky(seen: list[AssetView], views: Views) -> dict[str, float] | None:
-    """How much of the photos is sky, and how much of that the mesh hides; None without any."""
-    if views.sky is None:
+def _before_void(seen: list[AssetView], views: Views) -> dict[str, float] | None:
+    """How much of the photos shows that nothing stands there, and how much of that the mesh hides;
+    None without any.
+    """
+    if views.void is None:
         return None
-    num_sky = sum(int(mask.sum()) for mask in views.sky)
-    hidden = sum(int((view.hit & mask).sum()) for view, mask in zip(seen, views.sky, strict=True))
+    size = sum(int(mask.sum()) for mask in views.void)
+    hidden = sum(int((view.hit & mask).sum()) for view, mask in zip(seen, views.void, strict=True))
     return {
-        "share": round(num_sky / sum(mask.size for mask in views.sky), 4),
-        "hidden": round(hidden / max(num_sky, 1), 4),
+        "share": round(size / sum(mask.size for mask in views.void), 4),
+        "hidden": round(hidden / max(size, 1), 4),
     }
 
 

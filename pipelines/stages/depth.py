@@ -28,15 +28,17 @@ from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, config_from_dict
 from pipelines.nerf.stereo.completing import completed
+from pipelines.nerf.stereo.dark import find_dark
 from pipelines.nerf.stereo.engines import Engine, TorchEngine, choose_engine
 from pipelines.nerf.stereo.light import find_light
 from pipelines.nerf.stereo.maps import MapShelf, Progress, find_depth_maps, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.sensor import merged_maps, sensor_maps, sensor_scale
 from pipelines.nerf.stereo.shelves import Shelf
-from pipelines.nerf.stereo.sky import find_sky, without
+from pipelines.nerf.stereo.sky import find_sky
 from pipelines.nerf.stereo.standing import stood_up
 from pipelines.nerf.stereo.views import StereoView
+from pipelines.nerf.stereo.void import without
 from pipelines.option_models import StageOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsWriter
@@ -46,9 +48,9 @@ from pipelines.scene.stereo_views import sensor_depth, stereo_view, undistorted_
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 from pipelines.stages.depth_checkpoint import DepthCheckpoint, inputs_of
-from pipelines.stages.sky_masks import known_points, up_and_points
+from pipelines.stages.void_masks import known_points, up_and_points
 
-_LOAD_SHARE, _STEREO_SHARE, _SKY_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.7, 0.02, 0.1, 0.1
+_LOAD_SHARE, _STEREO_SHARE, _VOID_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.7, 0.02, 0.1, 0.1
 _LIGHT_SHARE = 0.03
 _PICTURE_VIEWS = 6
 
@@ -145,8 +147,8 @@ class _Search:
     def all_passes(self) -> Found:
         """Maps of all images, and what is told of them."""
         passes: list[tuple[str, Callable[[], Found]]] = [("matched", self._matched)]
-        if self.config.find_sky:
-            passes.append(("sky", self._without_sky))
+        if self.config.find_sky or self.config.find_dark:
+            passes.append(("void", self._without_void))
         if self.config.complete_planes:
             passes.append(("planes", self._completed))
         if self.config.standing_walls:
@@ -154,8 +156,8 @@ class _Search:
         for name, work in passes:
             if name not in self.checkpoint.passes:
                 self.checkpoint.complete(name, *work())
-            if name == "sky" and self.checkpoint.told["sky"]["share"] > 0.0:
-                self._see_no_sky()
+            if name == "void":
+                self._see_nothing_there()
         return self.checkpoint.maps(), self.checkpoint.told
 
     def color_picture(self, index: int) -> NDArray[np.uint8]:
@@ -219,54 +221,61 @@ class _Search:
             found.append(sensor_depth(root, image, lens, _pinhole(view)))
         return found
 
-    def _without_sky(self) -> Found:
+    def _without_void(self) -> Found:
         maps, views = self.checkpoint.maps(), self.views
-        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _SKY_SHARE)
+        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _VOID_SHARE)
 
-        def half_done(begun: float) -> Callable[[float], None]:
-            return lambda share: on_progress(begun + 0.5 * share, "looking for the sky")
+        def third(begun: int, message: str) -> Callable[[float], None]:
+            return lambda share: on_progress((begun + share) / 3.0, message)
 
-        sky = find_sky(
-            views,
-            self.color_picture,
-            maps.z,
-            *up_and_points(self.ctx.workspace, self.capture),
-            None if self.source == "stereo" else self._sensed(),
-            self.patches,
-            half_done(0.0),
-        )
-        told = {
-            "share": round(sky.share, 4),
-            "num_views": sky.num_views,
-            "far": round(sky.far, 3),
-        }
-        if sky.share > 0.0:
-            shelves = self.checkpoint.shelves
-            maps = without(sky, views, maps, self.config, half_done(0.5), self.engine, shelves)
-            self.ctx.logger.info("nothing stands where the pictures show the sky: %s", told)
-        return maps, {"sky": told}
+        sensed = None if self.source == "stereo" else self._sensed()
+        told: dict[str, Any] = {}
+        masks = [np.zeros(view.picture.shape, np.bool_) for view in views]
+        if self.config.find_sky:
+            known = up_and_points(self.ctx.workspace, self.capture)
+            given = views, self.color_picture, maps.z, *known, sensed, self.patches
+            sky = find_sky(*given, third(0, "looking for the sky"))
+            told["sky"] = {**_rounded(sky.share, sky.num_views), "far": round(sky.far, 3)}
+            masks = sky.masks
+        if self.config.find_dark:
+            seen = views, self.color_picture, maps.z, sensed, self.patches
+            dark = find_dark(*seen, third(1, "looking into the dark"))
+            told["dark"] = _rounded(dark.share, dark.num_views)
+            masks = [one | other for one, other in zip(masks, dark.masks, strict=True)]
+        if any(mask.any() for mask in masks):
+            on_share, shelves = third(2, "comparing what is nothing"), self.checkpoint.shelves
+            maps = without(masks, views, maps, self.config, on_share, self.engine, shelves)
+            self.ctx.logger.info("nothing stands where pictures show the sky or the dark: %s", told)
+        return maps, told
 
-    def _see_no_sky(self) -> None:
-        """What comes later looks at pictures that have nothing there."""
-        for index, found in enumerate(self.checkpoint.maps()):
-            picture = np.where(found.is_sky, np.float32(-1.0), self.views[index].picture)
+    def _see_nothing_there(self) -> None:
+        """What comes later looks at pictures that have nothing where nothing stands."""
+        found = [seen.is_void for seen in self.checkpoint.maps()]
+        if not any(mask.any() for mask in found):
+            return
+        for index, mask in enumerate(found):
+            picture = np.where(mask, np.float32(-1.0), self.views[index].picture)
             self.views[index] = replace(self.views[index], picture=picture)
         self.patches = self.checkpoint.shelves.scratch("patches", len(self.views))
 
     def _completed(self) -> Found:
         maps = self.checkpoint.maps()
         told = {"matched_share": round(_known_share(maps), 4)}
-        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE + _SKY_SHARE, _PLANES_SHARE)
+        on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE + _VOID_SHARE, _PLANES_SHARE)
         given = self.views, maps, self.config, on_progress, self.engine
         return completed(*given, self.checkpoint.shelves, self.patches), told
 
     def _stood_up(self) -> Found:
         maps = self.checkpoint.maps()
         told = {"before_walls_share": round(_known_share(maps), 4)}
-        begun = _LOAD_SHARE + _STEREO_SHARE + _SKY_SHARE + _PLANES_SHARE
+        begun = _LOAD_SHARE + _STEREO_SHARE + _VOID_SHARE + _PLANES_SHARE
         on_progress = self._progress(begun, _WALLS_SHARE)
         given = self.views, maps, self.config, on_progress, self.engine
         return stood_up(*given, self.checkpoint.shelves, self.patches), told
+
+
+def _rounded(share: float, num_views: int) -> dict[str, Any]:
+    return {"share": round(share, 4), "num_views": num_views}
 
 
 def _device(engine: Engine) -> str:
@@ -340,7 +349,7 @@ def _described(maps: MapShelf) -> dict[str, Any]:
 def _save_picture(path: Path, views: list[StereoView], maps: MapShelf) -> None:
     """Some of the pictures, their maps below: near is bright, far is dark, grey is unknown.
 
-    Sky is black in both.
+    What is nothing is black in both.
     """
     picked = evenly(len(views), _PICTURE_VIEWS)
     height = max(views[index].picture.shape[0] for index in picked)
@@ -349,7 +358,7 @@ def _save_picture(path: Path, views: list[StereoView], maps: MapShelf) -> None:
         grey = np.clip(views[index].picture, 0.0, 1.0)[..., None] * np.ones(3) * 255.0
         z = maps[index].z
         shades = depth_picture(z, depth_range(z))
-        shades[maps[index].is_sky] = 0
+        shades[maps[index].is_void] = 0
         both = (np.rint(grey).astype(np.uint8), shades)
         padded = [np.pad(item, ((0, height - len(item)), (0, 4), (0, 0))) for item in both]
         columns.append(np.concatenate(padded))

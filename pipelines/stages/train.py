@@ -206,7 +206,7 @@ def _depth_maps(
         )
     lenses = [image.lens for image in held.images]
     return DepthMaps.from_arrays(
-        [np.where(found.is_sky, np.float32(np.inf), found.z) for _, found in held],
+        [np.where(found.is_void, np.float32(np.inf), found.z) for _, found in held],
         [(lens.fl_x, lens.fl_y, lens.cx, lens.cy) for lens in lenses],
         scene.scale,
     )

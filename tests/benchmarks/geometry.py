@@ -4,10 +4,10 @@
         [--seed 0] [--frames 120] [--long-side 960] [--posed] [--out out/geometry] [--json FILE]
     python -m tests.benchmarks.geometry CAPTURE --job FOLDER [...]
 
-CAPTURE is an analytic scene (`bowl`, `room`, `object`, `furniture`, `cafe`, `monument`: all where
-none is named), or a real capture: a video, a .zip, or a folder, which is packed. A scene is filmed;
-with `--posed` its exact poses and depths come with it, so that surfaces are judged apart from
-poses;
+CAPTURE is an analytic scene (`bowl`, `room`, `object`, `furniture`, `cafe`, `monument`,
+`exhibit`: all where none is named), or a real capture: a video, a .zip, or a folder, which is
+packed. A scene is filmed; with `--posed` its exact poses and depths come with it, so that surfaces
+are judged apart from poses;
 `--set depth.source=stereo` leaves the depths to the judge. Each is put through a whole local
 job below `--out`; what is complete there and still current is not run again. `--job` judges a job
 that is finished already, made from that one CAPTURE; a scene's film must have had `--frames` and

@@ -95,11 +95,11 @@ def termination_loss(
     After DS-NeRF, arXiv:2107.02791, eq. 7, whose sum of logarithms over samples no ray can fulfil
     with all of them; here the ray's whole light is asked for.
     """
-    known, open_sky = distances > 0.0, torch.isinf(distances)
-    safe = torch.where(known & ~open_sky, distances, 1.0)[:, None]
+    known, void = distances > 0.0, torch.isinf(distances)
+    safe = torch.where(known & ~void, distances, 1.0)[:, None]
     off = (bin_midpoints(t_edges) - safe) / (safe * spread)
     near = (weights * torch.exp(-0.5 * off.square())).sum(dim=-1)
-    wanted = torch.where(open_sky, 1.0 - weights.sum(dim=-1), near)
+    wanted = torch.where(void, 1.0 - weights.sum(dim=-1), near)
     penalty = torch.where(known, -torch.log(wanted + TERMINATION_FLOOR), 0.0)
     return penalty.sum() / known.sum().clamp_min(1)
 

@@ -48,6 +48,12 @@ class StereoConfig:
         "Tell the sky from what stands before it, where things before a far background are seen "
         "against it: it has no depth, and training lets light through there.",
     )
+    find_dark: bool = option(
+        True,
+        "Tell the dark from what stands before it, where black and plain is a good part of the "
+        "pictures, as before black cloth: it has no depth where no lit surface lies, and training "
+        "lets light through there.",
+    )
     complete_planes: bool = option(
         True,
         "Lay patches of even brightness on the planes that all views together show, where at least "

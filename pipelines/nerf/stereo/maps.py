@@ -34,24 +34,24 @@ FEW_PHOTOS, _LONELY = 40, 0.2
 """Photos are few below that number, or where that share of what they show has one neighbour."""
 
 
-SKY = 255
-"""Votes of a pixel that has no depth because it shows the sky."""
+VOID = 255
+"""Votes of a pixel that has no depth because nothing stands there, as in the sky."""
 
 
 @dataclass(frozen=True)
 class DepthMap:
     """z: [H, W] float32, 0 where unknown. votes: [H, W] uint8, views that agree with each depth;
-    `SKY` where nothing stands.
+    `VOID` where nothing stands.
     """
 
     z: NDArray[np.float32]
     votes: NDArray[np.uint8]
 
     @property
-    def is_sky(self) -> NDArray[np.bool_]:
+    def is_void(self) -> NDArray[np.bool_]:
         """[H, W]: where nothing stands."""
-        sky: NDArray[np.bool_] = (self.z == 0) & (self.votes == SKY)
-        return sky
+        void: NDArray[np.bool_] = (self.z == 0) & (self.votes == VOID)
+        return void
 
 
 class MapShelf:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import types
 
 from pipelines.sample.film import SAMPLE_TAKE
-from pipelines.sample.scenes import cafe, furniture, monument, room
+from pipelines.sample.scenes import cafe, exhibit, furniture, monument, room
 from pipelines.sample.scenes import object as object_on_stand
 from pipelines.sample.takes import Take
 
@@ -19,6 +19,7 @@ TAKES: types.MappingProxyType[str, Take] = types.MappingProxyType(
             furniture.TAKE,
             cafe.TAKE,
             monument.TAKE,
+            exhibit.TAKE,
         )
     }
 )

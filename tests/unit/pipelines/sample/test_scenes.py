@@ -19,13 +19,13 @@ from pipelines.sample.scene import (
     render,
     surface_distance,
 )
-from pipelines.sample.scenes import cafe, furniture, monument, room
+from pipelines.sample.scenes import cafe, exhibit, furniture, monument, room
 from pipelines.sample.scenes import object as object_on_stand
 from pipelines.sample.scenes.catalogue import TAKES
 from pipelines.sample.takes import Take
 from pipelines.scene.cameras_file import Intrinsics
 
-NEW = (room.TAKE, object_on_stand.TAKE, furniture.TAKE, cafe.TAKE, monument.TAKE)
+NEW = (room.TAKE, object_on_stand.TAKE, furniture.TAKE, cafe.TAKE, monument.TAKE, exhibit.TAKE)
 
 
 def _rays(take: Take, num: int) -> tuple[Floats, Floats]:
@@ -202,7 +202,7 @@ def test_pictures_of_a_take_are_of_its_scene_at_its_exposure() -> None:
 def test_all_round_is_all_round() -> None:
     for take in (room.TAKE, object_on_stand.TAKE):
         assert walk(60, phone_camera(64), take=take).notes["arc_deg"] > 355.0
-    assert set(TAKES) == {"bowl", "room", "object", "furniture", "cafe", "monument"}
+    assert set(TAKES) == {"bowl", "room", "object", "furniture", "cafe", "monument", "exhibit"}
     gaze = np.array([-room.pose(p)[:, 2] for p in np.linspace(0, 1, 60)])
     outwards = np.array([room.pose(p)[:2, 3] for p in np.linspace(0, 1, 60)])
     assert (np.einsum("nk,nk->n", gaze[:, :2], outwards) > 0).all()

@@ -107,7 +107,7 @@ def test_the_true_surface_covers_the_photos_and_looks_like_them(job: Workspace) 
     assert assets["cloud"]["psnr"] > 15.0
     assert assets["cloud"]["median_spacing"] > 0.0
     assert assets["warnings"] == []
-    assert (assets["depth"], assets["depth_agreement"], assets["sky"]) == (None, None, None)
+    assert (assets["depth"], assets["depth_agreement"], assets["void"]) == (None, None, None)
     assert assets["depth_reason"]
     assert assets["depth_agreement_reason"]
     pictures = sorted((job.stage("assess") / "images").iterdir())

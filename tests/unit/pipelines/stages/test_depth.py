@@ -20,22 +20,18 @@ from pipelines.exports.texture.photos import Photos
 from pipelines.manifest import RunHooks
 from pipelines.nerf.data.light import exposed
 from pipelines.nerf.stereo.engines import TorchEngine
-from pipelines.options import AssessOptions, OptionsError, resolve_options
+from pipelines.options import OptionsError, resolve_options
 from pipelines.sample.scene import depth_image, pose_matrix
-from pipelines.sample.scenes import monument
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.depth_maps_file import INDEX, DepthMapsFile
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.stereo_views import undistorted_picture
-from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stages import depth
-from pipelines.stages.assess import load_views
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
 STEREO = {"long_side_px": 64, "num_planes": 64, "window_radius": 2, "complete_planes": False}
 """Without guesses, so that every depth is one that was matched or measured."""
-OUTDOORS = {"long_side_px": 128, "num_planes": 64, "num_neighbours": 4}
 
 
 @pytest.fixture(scope="module")
@@ -218,97 +214,9 @@ def how_right(workspace: Workspace) -> tuple[float, float]:
     return float(np.mean(known)), float(np.stack(right)[np.stack(known)].mean())
 
 
-@pytest.fixture(scope="module")
-def outdoors(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """A figure in a square, under the sky, at twice the size."""
-    root = tmp_path_factory.mktemp("outdoors") / "job"
-    workspace = tiny_job.make_capture(root, 24, monument.TAKE, 128)
-    tiny_job.run(workspace, "depth", **OUTDOORS)
-    return workspace
-
-
-def sky_and_known(workspace: Workspace) -> tuple[float, float, float]:
-    """Of the sky, shares that are told and that have a depth; of all else, that is told."""
-    capture = CamerasFile.load(workspace.stage("ingest") / "cameras.json")
-    truth = {image.file: image for image in capture.images}
-    told, known, wrong = [], [], []
-    for held, found in DepthMapsFile(workspace.stage("depth")):
-        exact = depth_image(capture.cameras[0], pose_matrix(truth[held.file]), monument.SCENE)
-        told.append(found.is_sky[exact == 0])
-        known.append(found.z[exact == 0] > 0)
-        wrong.append(found.is_sky[exact > 0])
-    shares = [float(np.concatenate(item).mean()) for item in (told, known, wrong)]
-    return shares[0], shares[1], shares[2]
-
-
-def test_the_sky_has_no_depth(outdoors: Workspace, tmp_path: Path) -> None:
-    summary = outdoors.manifest("depth")["summary"]
-    assert summary["sky"]["share"] > 0.2
-    assert summary["sky"]["num_views"] >= 20
-    told, known, wrong = sky_and_known(outdoors)
-    assert told > 0.8
-    assert known < 0.05
-    assert wrong < 0.01
-    left = tiny_job.make_capture(tmp_path / "job", 24, monument.TAKE, 128)
-    summary = tiny_job.run(left, "depth", **OUTDOORS | {"find_sky": False})["summary"]
-    assert "sky" not in summary
-    told_before, known_before, _ = sky_and_known(left)
-    assert told_before == 0.0
-    assert known_before > known + 0.05
-
-
-def test_a_room_has_no_sky(mapped: Workspace) -> None:
-    assert mapped.manifest("depth")["summary"]["sky"]["share"] == 0.0
-
-
-@pytest.fixture(scope="module")
-def trained_outdoors(outdoors: Workspace) -> Workspace:
-    tiny_job.run(outdoors, "train")
-    return outdoors
-
-
-def test_the_sky_of_held_out_photos_is_no_hole(trained_outdoors: Workspace) -> None:
-    views = load_views(trained_outdoors, AssessOptions(long_side_px=64))
-    assert views.held_out
-    assert views.sky is not None
-    lens = views.posed[0].camera
-    camera = CamerasFile.load(trained_outdoors.stage("ingest") / "cameras.json").cameras[lens]
-    for index, image in enumerate(views.posed):
-        small = Pinhole.of(camera, 64).intrinsics()
-        exact = depth_image(small, pose_matrix(image), monument.SCENE)
-        valid = views.valid(index)
-        assert valid is not None
-        assert valid.shape == exact.shape
-        assert valid[exact == 0].mean() < 0.15
-        assert valid[exact > 0].mean() > 0.97
-
-
-def test_a_photo_of_which_nothing_but_sky_counts_is_looked_at_whole(
-    trained_outdoors: Workspace,
-) -> None:
-    views = load_views(trained_outdoors, AssessOptions(long_side_px=64))
-    height, width = views.photo(0).shape[:2]
-    everywhere = [np.ones((height, width), bool)] * len(views.posed)
-    assert dataclasses.replace(views, sky=everywhere).valid(0) is None
-    upper = np.zeros((height, width), bool)
-    upper[: height // 2] = True
-    every = torch.from_numpy(np.concatenate([upper.ravel()] * len(views.posed)))
-    masked = dataclasses.replace(views.images, valid=every)
-    valid = dataclasses.replace(views, images=masked, sky=[upper] * len(views.posed)).valid(0)
-    assert valid is not None
-    assert (valid == upper).all()
-
-
-def test_training_lets_light_through_where_the_sky_is(trained_outdoors: Workspace) -> None:
-    scene = TrainedScene.load(trained_outdoors.stage("train") / "model.zip")
-    image = scene.training_images()[5]
-    lens = Pinhole.of(scene.lens_of(image), 64)
-    pose = np.asarray(image.world_from_camera, np.float64)
-    exact = depth_image(lens.intrinsics(), pose, monument.SCENE)
-    solid = scene.depth_view(lens, pose).z_depth > 0
-    assert solid[exact == 0].mean() < 0.1
-    near = (exact > 0) & (exact < 4.0)
-    assert solid[near].mean() > 0.8
+def test_a_painted_room_has_no_sky_and_no_dark(mapped: Workspace) -> None:
+    summary = mapped.manifest("depth")["summary"]
+    assert (summary["sky"]["share"], summary["dark"]["share"]) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("source", ["auto", "sensor"])

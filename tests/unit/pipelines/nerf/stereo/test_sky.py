@@ -7,12 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.maps import SKY, DepthMap, MapShelf
-from pipelines.nerf.stereo.sky import Sky, find_sky, without
+from pipelines.nerf.stereo.sky import Sky, find_sky
 from tests.unit.pipelines.nerf.stereo.monument import (
     NUM_VIEWS,
-    ON_PILLAR,
     SKY_COLOR,
     UP,
     Seen,
@@ -20,7 +17,6 @@ from tests.unit.pipelines.nerf.stereo.monument import (
 )
 
 NO_POINTS = np.zeros((0, 3))
-CONFIG = StereoConfig(num_neighbours=4)
 
 
 def sky_of(seen: list[Seen], points: np.ndarray = NO_POINTS, up: np.ndarray = UP) -> Sky:
@@ -35,9 +31,9 @@ def test_all_of_the_sky_is_found_and_nothing_else(color: tuple[float, float, flo
     assert found.num_views == NUM_VIEWS
     assert found.far == 1.0
     for one, mask in zip(seen, found.masks, strict=True):
-        assert one.is_sky.mean() > 0.2
-        assert mask[one.is_sky].mean() > 0.97
-        assert mask[~one.is_sky].mean() < 0.01
+        assert one.is_void.mean() > 0.2
+        assert mask[one.is_void].mean() > 0.97
+        assert mask[~one.is_void].mean() < 0.01
 
 
 def test_a_white_wall_close_behind_is_no_sky() -> None:
@@ -74,7 +70,7 @@ def test_what_a_sensor_measures_is_no_sky() -> None:
     seen = walk_round()
     given = [one.view for one in seen], lambda index: seen[index].picture
     depths = [one.known().z for one in seen]
-    hall = [np.where(one.is_sky, np.float32(9.0), one.depth) for one in seen]
+    hall = [np.where(one.is_void, np.float32(9.0), one.depth) for one in seen]
     outdoors: list[np.ndarray | None] = [one.depth for one in seen]
     assert find_sky(*given, depths, UP, NO_POINTS, hall).share == 0.0
     assert find_sky(*given, depths, UP, NO_POINTS, outdoors).share > 0.2
@@ -84,7 +80,7 @@ def test_what_a_sensor_measures_is_no_sky() -> None:
 def test_few_pictures_that_may_show_sky_are_not_enough() -> None:
     seen = walk_round()
     dark = [
-        dataclasses.replace(one, picture=np.where(one.is_sky[..., None], 90, one.picture))
+        dataclasses.replace(one, picture=np.where(one.is_void[..., None], 90, one.picture))
         for one in seen
     ]
     found = sky_of(seen[:2] + dark[2:])
@@ -97,47 +93,13 @@ def test_dark_twigs_at_its_border_make_it_no_less_sky() -> None:
     rng = np.random.default_rng(0)
     seen = []
     for one in walk_round():
-        rim = one.is_sky & ~np.roll(one.is_sky, -2, axis=0) & (rng.random(one.is_sky.shape) < 0.8)
+        rim = (
+            one.is_void & ~np.roll(one.is_void, -2, axis=0) & (rng.random(one.is_void.shape) < 0.8)
+        )
         picture = np.where(rim[..., None], np.uint8(10), one.picture)
-        assert np.std(picture[one.is_sky] / 255.0) > 0.06
+        assert np.std(picture[one.is_void] / 255.0) > 0.06
         seen.append(dataclasses.replace(one, picture=picture))
     found = sky_of(seen)
     assert found.num_views == NUM_VIEWS
     for one, mask in zip(seen, found.masks, strict=True):
-        assert mask[one.is_sky].mean() > 0.95
-
-
-def test_nothing_is_left_where_the_sky_is_and_the_rest_stays() -> None:
-    seen = walk_round()
-    maps = MapShelf.of([one.known() for one in seen])
-    left = without(sky_of(seen), [one.view for one in seen], maps, CONFIG)
-    for one, before, found in zip(seen, maps, left, strict=True):
-        assert (before.z[one.is_sky] > 0).mean() > 0.5
-        assert (found.z[one.is_sky] > 0).mean() < 0.03
-        assert found.is_sky[one.is_sky].mean() > 0.93
-        assert not found.is_sky[~one.is_sky].any()
-        on_pillar = one.what == ON_PILLAR
-        same = (found.z == before.z) & (found.votes == before.votes)
-        assert same[on_pillar].mean() > 0.97
-        assert ((found.votes == SKY) == found.is_sky).all()
-
-
-def test_a_sheet_before_the_sky_that_others_see_goes_too() -> None:
-    """One picture's sky was not told, since a gull's colour was on it; its neighbours' was."""
-    seen = walk_round()
-    maps = MapShelf.of([one.known() for one in seen])
-    found = sky_of(seen)
-    masks = [found.masks[0] & False, *found.masks[1:]]
-    views = [one.view for one in seen]
-    left = without(dataclasses.replace(found, masks=masks), views, maps, CONFIG)
-    sheet = seen[0].is_sky & (maps[0].z > 0)
-    assert sheet.sum() > 1000
-    assert (left[0].z[sheet] > 0).mean() < 0.3
-    on_pillar = seen[0].what == ON_PILLAR
-    assert (left[0].z[on_pillar] > 0).mean() > 0.9
-
-
-def test_sky_is_no_depth() -> None:
-    z = np.array([[0.0, 2.0, 0.0]], np.float32)
-    found = DepthMap(z, np.array([[SKY, SKY, 0]], np.uint8))
-    assert found.is_sky.tolist() == [[True, False, False]]
+        assert mask[one.is_void].mean() > 0.95

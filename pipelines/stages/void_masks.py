@@ -1,9 +1,10 @@
-"""Where images show the sky, held-out ones too, in captures where the stage `depth` found any."""
+"""Where images show that nothing stands, held-out ones too, in captures where `depth` found any."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +12,21 @@ from numpy.typing import NDArray
 from pipelines.exports.formats.ply import read_ply
 from pipelines.nerf.data.depth_maps import DepthMaps
 from pipelines.nerf.space.cameras import Cameras
+from pipelines.nerf.stereo.dark import before_solid, like_dark, solid_points
 from pipelines.nerf.stereo.sky import like_sky
+from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
+from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.orientation import find_up
-from pipelines.scene.stereo_views import stereo_view, undistorted_picture
+from pipelines.scene.stereo_views import stereo_view, undistorted_picture, view_of
 from pipelines.workspace import Workspace
 
 Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+Look = Callable[[StereoView, Bytes], Bools]
+"""What of a view's picture, [H, W, 3] sRGB, is nothing: [H, W]."""
 
 
 def known_points(workspace: Workspace) -> Floats | None:
@@ -35,20 +42,20 @@ def up_and_points(workspace: Workspace, capture: CamerasFile) -> tuple[Floats, F
     return up, np.zeros((0, 3)) if points is None else points
 
 
-def sky_masks(
+def void_masks(
     workspace: Workspace, capture: CamerasFile, images: Sequence[PosedImage], cameras: Cameras
 ) -> list[Bools] | None:
-    """Where each image shows the sky, [H, W] at its camera's size; None where `depth` found none.
+    """Where nothing stands in each image, [H, W] at its camera's size; None where `depth` found no
+    sky and no dark.
 
     capture: that the images are of. cameras: theirs, in their order.
     """
     if not workspace.is_complete("depth"):
         return None
     made = workspace.manifest("depth")
-    told = made["summary"].get("sky")
-    if not told or told["share"] == 0.0:
+    looks = _looks(workspace, capture, made["summary"])
+    if not looks:
         return None
-    up, points = up_and_points(workspace, capture)
     side, root = made["options"]["long_side_px"], workspace.images_root
     found, lenses = [], []
     for image in images:
@@ -58,7 +65,8 @@ def sky_masks(
         pinhole = Pinhole(width, height, *view.lens)
         # As `depth` saw it: before the pictures were brought to one light.
         picture = undistorted_picture(root, replace(image, light=None), lens, pinhole)
-        found.append(like_sky(view, picture, up, points).astype(np.float32))
+        mask = np.any([look(view, picture) for look in looks], axis=0)
+        found.append(mask.astype(np.float32))
         lenses.append(view.lens)
     maps = DepthMaps.from_arrays(found, lenses, 1.0)
     masks = []
@@ -66,3 +74,26 @@ def sky_masks(
         asked = maps.distances(cameras.image_rays(index), cameras)
         masks.append((asked > 0.0).numpy().reshape(height, width))
     return masks
+
+
+def _looks(workspace: Workspace, capture: CamerasFile, told: dict[str, Any]) -> list[Look]:
+    """How to tell each of the kinds of nothing that `depth` told of."""
+    looks: list[Look] = []
+    if told.get("sky", {}).get("share"):
+        known = up_and_points(workspace, capture)
+        looks.append(lambda view, picture: like_sky(view, picture, *known))
+    if told.get("dark", {}).get("share"):
+        solid = _solid_points(workspace, capture)
+        looks.append(lambda view, picture: like_dark(view, picture) & ~before_solid(view, solid))
+    return looks
+
+
+def _solid_points(workspace: Workspace, capture: CamerasFile) -> Floats:
+    """[P, 3], world, on surfaces that the depth maps know."""
+    images = {image.file: image for image in capture.images}
+    views, depths, void = [], [], []
+    for image, found in DepthMapsFile(workspace.stage("depth")):
+        views.append(view_of(images[image.file], image.lens, found.z))
+        depths.append(found.z)
+        void.append(found.is_void)
+    return solid_points(views, depths, void)

@@ -1,0 +1,130 @@
+"""Where nothing stands: no depth, no hole, and training lets light through; sky and dark alike."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipelines.options import AssessOptions
+from pipelines.sample.scene import depth_image, pose_matrix
+from pipelines.sample.scenes import exhibit, monument
+from pipelines.sample.takes import Take
+from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.depth_maps_file import DepthMapsFile
+from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.trained_scene import TrainedScene
+from pipelines.stages.assess import load_views
+from pipelines.workspace import Workspace
+from tests.unit.pipelines.stages import tiny_job
+
+STEREO = {"long_side_px": 128, "num_planes": 64, "num_neighbours": 4}
+TAKES = {"sky": monument.TAKE, "dark": exhibit.TAKE}
+
+
+@dataclasses.dataclass(frozen=True)
+class Filmed:
+    """A take at twice the usual size, and which kind of nothing it shows."""
+
+    kind: str
+    take: Take
+    workspace: Workspace
+
+    def exact(self, lens: Pinhole, pose: np.ndarray) -> np.ndarray:
+        """True depth, [H, W], 0 where nothing stands."""
+        depth: np.ndarray = depth_image(lens.intrinsics(), pose, self.take.scene)
+        return depth
+
+
+@pytest.fixture(scope="module", params=TAKES)
+def mapped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    """A figure in a square, under the sky; a ruin before black."""
+    root, take = tmp_path_factory.mktemp(request.param) / "job", TAKES[request.param]
+    workspace = tiny_job.make_capture(root, 24, take, 128)
+    tiny_job.run(workspace, "depth", **STEREO)
+    return Filmed(request.param, take, workspace)
+
+
+@pytest.fixture(scope="module")
+def trained(mapped: Filmed) -> Filmed:
+    tiny_job.run(mapped.workspace, "train")
+    return mapped
+
+
+def void_and_known(film: Filmed) -> tuple[float, float, float]:
+    """Of what is nothing, shares that are told and that have a depth; of all else, that is told."""
+    capture = CamerasFile.load(film.workspace.stage("ingest") / "cameras.json")
+    truth = {image.file: image for image in capture.images}
+    told, known, wrong = [], [], []
+    for held, found in DepthMapsFile(film.workspace.stage("depth")):
+        exact = depth_image(capture.cameras[0], pose_matrix(truth[held.file]), film.take.scene)
+        told.append(found.is_void[exact == 0])
+        known.append(found.z[exact == 0] > 0)
+        wrong.append(found.is_void[exact > 0])
+    shares = [float(np.concatenate(item).mean()) for item in (told, known, wrong)]
+    return shares[0], shares[1], shares[2]
+
+
+def test_what_is_nothing_has_no_depth(mapped: Filmed) -> None:
+    summary = mapped.workspace.manifest("depth")["summary"]
+    for kind in TAKES:
+        assert (summary[kind]["share"] > 0.2) == (kind == mapped.kind)
+    assert summary[mapped.kind]["num_views"] >= 20
+    told, known, wrong = void_and_known(mapped)
+    assert told > 0.8
+    assert known < 0.05
+    assert wrong < 0.01
+
+
+def test_unasked_it_is_filled_by_what_is_beside_it(mapped: Filmed, tmp_path: Path) -> None:
+    left = tiny_job.make_capture(tmp_path / "job", 24, mapped.take, 128)
+    options = STEREO | {"find_sky": False, "find_dark": False}
+    summary = tiny_job.run(left, "depth", **options)["summary"]
+    assert not set(TAKES) & set(summary)
+    told, known, _ = void_and_known(dataclasses.replace(mapped, workspace=left))
+    assert told == 0.0
+    assert known > void_and_known(mapped)[1] + 0.05
+
+
+def test_held_out_photos_of_it_have_no_hole(trained: Filmed) -> None:
+    views = load_views(trained.workspace, AssessOptions(long_side_px=64))
+    assert views.held_out
+    assert views.void is not None
+    lens = views.posed[0].camera
+    camera = CamerasFile.load(trained.workspace.stage("ingest") / "cameras.json").cameras[lens]
+    for index, image in enumerate(views.posed):
+        exact = trained.exact(Pinhole.of(camera, 64), pose_matrix(image))
+        valid = views.valid(index)
+        assert valid is not None
+        assert valid.shape == exact.shape
+        assert valid[exact == 0].mean() < 0.15
+        assert valid[exact > 0].mean() > 0.97
+
+
+def test_a_photo_of_which_nothing_else_counts_is_looked_at_whole(trained: Filmed) -> None:
+    views = load_views(trained.workspace, AssessOptions(long_side_px=64))
+    height, width = views.photo(0).shape[:2]
+    everywhere = [np.ones((height, width), bool)] * len(views.posed)
+    assert dataclasses.replace(views, void=everywhere).valid(0) is None
+    upper = np.zeros((height, width), bool)
+    upper[: height // 2] = True
+    every = torch.from_numpy(np.concatenate([upper.ravel()] * len(views.posed)))
+    masked = dataclasses.replace(views.images, valid=every)
+    valid = dataclasses.replace(views, images=masked, void=[upper] * len(views.posed)).valid(0)
+    assert valid is not None
+    assert (valid == upper).all()
+
+
+def test_training_lets_light_through_there(trained: Filmed) -> None:
+    scene = TrainedScene.load(trained.workspace.stage("train") / "model.zip")
+    image = scene.training_images()[5]
+    lens = Pinhole.of(scene.lens_of(image), 64)
+    pose = np.asarray(image.world_from_camera, np.float64)
+    exact = trained.exact(lens, pose)
+    solid = scene.depth_view(lens, pose).z_depth > 0
+    assert solid[exact == 0].mean() < 0.1
+    near = (exact > 0) & (exact < 4.0)
+    assert solid[near].mean() > 0.8
