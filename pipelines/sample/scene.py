@@ -142,8 +142,8 @@ class Scene:
     sRGB. light: [3], a lamp inside the room. subject: what meshes are judged on; its longest side
     is the size that tolerances refer to. things: the same without floor and walls, which fit onto
     themselves under many wrong moves. beyond: how far outside the subject a mesh is judged, metres:
-    of a room, whose wrong walls lie outside it. reach: what is farther away, metres, is the sky and
-    has no depth.
+    of a room, whose wrong walls lie outside it. reach: what is farther away, metres, is
+    nothing, sky or darkness, and has no depth.
     """
 
     name: str
@@ -263,7 +263,7 @@ def pixel_rays(
 
 
 def depth_image(camera: Intrinsics, world_from_camera: Floats, scene: Scene = SAMPLE) -> Floats:
-    """Exact z-depth at the pixel centres, [H, W], metres; 0 for the sky."""
+    """Exact z-depth at the pixel centres, [H, W], metres; 0 where nothing stands."""
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     origins, directions = pixel_rays(camera, world_from_camera, pixels)

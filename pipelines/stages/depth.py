@@ -237,7 +237,8 @@ class _Search:
             sky = find_sky(*given, third(0, "looking for the sky"))
             told["sky"] = {**_rounded(sky.share, sky.num_views), "far": round(sky.far, 3)}
             masks = sky.masks
-        if self.config.find_dark:
+        # By day what is black is an unlit side of something.
+        if self.config.find_dark and not told.get("sky", {}).get("share"):
             seen = views, self.color_picture, maps.z, sensed, self.patches
             dark = find_dark(*seen, third(1, "looking into the dark"))
             told["dark"] = _rounded(dark.share, dark.num_views)

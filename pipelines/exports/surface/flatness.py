@@ -61,6 +61,8 @@ _RELIEF, _RELIEF_TRUST = 0.5, 0.25
 """Edges that a vertex and all around it stand out by, and the trust in that, to stay as it is."""
 _SURE, _SLACK = 0.3, 1.5
 """Trust in the photos' answer, and half pixels that such a vertex may leave it by."""
+_MOST_ALONE = 2.0
+"""A vertex on a plane goes so many times as far as its neighbours do."""
 _SMOOTH, _TO_PLANE = 10.0, 0.005
 _PIXEL, _FINEST = 0.3, 5.0
 """Half a pixel of the photos, in edges, of which an answer has its trust as weight; where photos
@@ -135,7 +137,8 @@ def flattened(
         weights = np.where(on, trust * np.clip(exact, 1.0, _FINEST) ** 2, 0.0)
         kept = _shared(wanted, weights, np.where(on, plane_of, NOWHERE), rings)
         slack = np.where(trust > _SURE, _SLACK * answers.half_pixel, np.inf)
-        kept = np.clip(kept, wanted - slack, wanted + slack)
+        sure = np.clip(kept, wanted - slack, wanted + slack) - kept
+        kept = kept + _not_alone(np.where(on, sure, 0.0), rings)
     moves = np.where(on[:, None], (kept - away)[:, None] * normals, 0.0)
     weights = np.where(on, _MOVE, _HOLD)
     matrix = (diags_array(weights) + rings.laplacian).tocsr()
@@ -319,6 +322,18 @@ def _shared(wanted: Floats, trust: Floats, plane_of: Ints, rings: MeshRings) -> 
     degree = np.asarray(edges.sum(axis=1)).ravel()
     matrix = diags_array(trust + _TO_PLANE) + _SMOOTH * (diags_array(degree) - edges)
     return _solved(matrix.tocsr(), trust * wanted)
+
+
+def _not_alone(moves: Floats, rings: MeshRings) -> Floats:
+    """The moves [V] as far as the neighbours', in the mean, are half of them.
+
+    One vertex that the photos are sure of, and none around it, has been mistaken for another.
+    """
+    around = _MOST_ALONE * (rings.around @ moves) / np.maximum(rings.degree, 1.0)
+    shared: Floats = np.where(
+        moves * around > 0.0, np.copysign(np.minimum(abs(moves), abs(around)), moves), 0.0
+    )
+    return shared
 
 
 def edges_within(plane_of: Ints, rings: MeshRings) -> csr_array:

@@ -24,7 +24,7 @@ from pipelines.nerf.stereo.maps import (
     votes_of_others,
 )
 from pipelines.nerf.stereo.neighbours import choose_neighbours
-from pipelines.nerf.stereo.patches import Labels, even_patches, patches_of
+from pipelines.nerf.stereo.patches import even_patches, shelved_patches
 from pipelines.nerf.stereo.planes import (
     ON_PLANE,
     Depths,
@@ -89,16 +89,6 @@ def completed(
         engine,
         MapShelf.kept(shelves, "planes", len(views), fresh=True),
     )
-
-
-def shelved_patches(view: StereoView, index: int, shelf: Shelf | None) -> Labels:
-    """`patches_of` a view's picture, found once where there is a shelf for them."""
-    if shelf is None:
-        return patches_of(view.picture)
-    if not shelf.has(index):
-        shelf[index] = patches_of(view.picture)
-    found: Labels = shelf[index]
-    return found
 
 
 def confirmed(

@@ -23,24 +23,27 @@ from pipelines.nerf.stereo.patch_colors import (
     Bytes,
     Floats,
     PatchColors,
-    patches_on,
 )
-from pipelines.nerf.stereo.patches import Labels
+from pipelines.nerf.stereo.patches import Labels, shelved_patches
 from pipelines.nerf.stereo.shelves import ByView, Shelf
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.nerf.stereo.void import is_measured
 
 _MOST_BRIGHT, _MOST_SPREAD = 0.12, 0.04
 """Of colours: the mean of the brightest channel; standard deviation."""
-_LEAST_VIEWS, _LEAST_SHARE = 0.5, 0.15
-"""So much of all pictures is black, and so many of them show some of it. The blackest of the rooms
-at hand has 5 % of such patches, a thing before black cloth 30 to 60 %."""
-_POINTS_PER_PX, _MOST_DARK, _BESIDE = 3.5, 0.2, 0.5
-"""Points on surfaces that are asked, in all, per pixel of one picture. A solid one is black in no
-more of the views that look at it from the same side as the one that has it, by the cosine of the
-angle between them. From the other side one may see an unlit back of it."""
+_LEAST_SHARE, _LEAST_VIEWS, _MOST_MASKED = 0.15, 0.5, 0.2
+"""So much of all pictures is black, and so many of them show some of it; no more of them is masked,
+as what is around a thing that somebody has cut out is nothing anyhow, and the thing may be black.
+The blackest of the rooms at hand has 5 % of such patches, a thing before black cloth 30 to 60 %."""
+_POINTS_PER_PX, _MOST_DARK, _BESIDE = 10.0, 0.2, 0.5
+"""Points on surfaces that are asked, in all, per pixel of one picture: enough for one taken from a
+third of the distance. A solid one is black in no more of the views that look at it from the same
+side as the one that has it, by the cosine of the angle between them. From the other side one may
+see an unlit back of it."""
 _LEAST_SOLID = 5
 """Pixels of a square of nine with solid points, where its middle is not nothing."""
+_BLACK_SHARE, _SOLID_SHARE = 0.5, 0.9
+"""Of the progress, at the end of each part."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +75,27 @@ def find_dark(
     """
     black = []
     for index, view in enumerate(views):
-        black.append(like_dark(view, picture_of(index), patches_on(patches, index, view)))
-        on_share((index + 1) / len(views))
+        patch_numbers = shelved_patches(view, index, patches)
+        black.append(like_dark(view, picture_of(index), patch_numbers))
+        on_share(_BLACK_SHARE * (index + 1) / len(views))
+    nothing = [np.zeros_like(mask) for mask in black]
     num_views = sum(bool(mask.any()) for mask in black)
     share = float(np.mean([mask.mean() for mask in black]))
+    masked = float(np.mean([(view.picture < 0.0).mean() for view in views]))
     too_little = num_views < _LEAST_VIEWS * len(views) or share < _LEAST_SHARE
-    if too_little or is_measured(black, measured):
-        return Dark([np.zeros_like(mask) for mask in black], 0.0, num_views)
-    solid = solid_points(views, depths, black)
-    masks = [mask & ~before_solid(view, solid) for view, mask in zip(views, black, strict=True)]
+    if too_little or masked > _MOST_MASKED:
+        return Dark(nothing, 0.0, num_views)
+
+    def on_solid(share: float) -> None:
+        on_share(_BLACK_SHARE + (_SOLID_SHARE - _BLACK_SHARE) * share)
+
+    solid = solid_points(views, depths, black, on_solid)
+    masks = []
+    for index, (view, mask) in enumerate(zip(views, black, strict=True)):
+        masks.append(mask & ~before_solid(view, solid))
+        on_share(_SOLID_SHARE + (1.0 - _SOLID_SHARE) * (index + 1) / len(views))
+    if is_measured(masks, measured):
+        return Dark(nothing, 0.0, num_views)
     return Dark(masks, float(np.mean([mask.mean() for mask in masks])), num_views)
 
 
@@ -102,12 +117,15 @@ def solid_points(
     views: Sequence[StereoView],
     depths: ByView[NDArray[np.float32]],
     dark: Sequence[Bools],
+    on_share: Callable[[float], None] = lambda done: None,
 ) -> Floats:
     """Points [P, 3], world, on what is not dark where it is seen.
 
-    depths: as of the views, [H, W]; those at pixels that are `dark` do not count.
+    depths: as of the views, [H, W]; those at pixels that are `dark` do not count. on_share: told
+    the share that is done; may raise.
     """
-    per_view = max(1, round(_POINTS_PER_PX * views[0].picture.size / len(views)))
+    size = float(np.mean([view.picture.size for view in views]))
+    per_view = max(1, round(_POINTS_PER_PX * size / len(views)))
     found = [
         _thinned(back_project(view, np.where(black, np.float32(0.0), z)), per_view)
         for view, z, black in zip(views, depths, dark, strict=True)
@@ -117,13 +135,13 @@ def solid_points(
         [_unit(view.center - some) for view, some in zip(views, found, strict=True)]
     )
     shown, unlit = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
-    for view, black in zip(views, dark, strict=True):
-        beside = np.flatnonzero(
-            ((_unit(view.center - points) * towards).sum(axis=1) >= _BESIDE) & view.seen(points)[1]
-        )
-        _, rows, columns = view.seen_at(points[beside])
-        shown[beside] += 1
-        unlit[beside] += black[rows, columns]
+    for index, (view, black) in enumerate(zip(views, dark, strict=True)):
+        at, rows, columns = view.shown_at(points)
+        cosine = (_unit(view.center - points[at]) * towards[at]).sum(axis=1)
+        asked = (cosine >= _BESIDE) & (view.picture[rows, columns] >= 0.0)
+        shown[at[asked]] += 1
+        unlit[at[asked]] += black[rows[asked], columns[asked]]
+        on_share((index + 1) / len(views))
     solid: Floats = points[unlit <= _MOST_DARK * shown]
     return solid
 
@@ -131,7 +149,7 @@ def solid_points(
 def before_solid(view: StereoView, points: Floats) -> Bools:
     """[H, W]: where a picture looks at some of the solid points [P, 3], or past what hides them."""
     height, width = view.picture.shape
-    _, rows, columns = view.seen_at(points)
+    _, rows, columns = view.shown_at(points)
     some = np.zeros((height + 2, width + 2), np.int64)
     some[rows + 1, columns + 1] = 1
     around = sum(

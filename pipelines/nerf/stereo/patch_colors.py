@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from skimage.morphology import dilation, erosion
 from skimage.segmentation import expand_labels
 
-from pipelines.nerf.stereo.patches import Labels, even_patches, patches_of
-from pipelines.nerf.stereo.shelves import Shelf
+from pipelines.nerf.stereo.patches import Labels, even_patches
 from pipelines.nerf.stereo.views import StereoView
 
 Bools = NDArray[np.bool_]
@@ -82,16 +81,6 @@ class PatchColors:
         off = np.abs(self.picture / 255.0 - self.mean[np.maximum(own - 1, 0)]).max(axis=-1)
         fringed: Bools = found | (self.there & (own > 0) & (off <= _ALIKE))
         return fringed
-
-
-def patches_on(shelf: Shelf | None, index: int, view: StereoView) -> Labels | None:
-    """The picture's `patches_of` from the shelf, where they are put first; None without one."""
-    if shelf is None:
-        return None
-    if not shelf.has(index):
-        shelf[index] = patches_of(view.picture)
-    found: Labels = shelf[index]
-    return found
 
 
 def grown(mask: Bools, radius: int) -> Bools:

@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.segmentation import felzenszwalb
 
+from pipelines.nerf.stereo.shelves import Shelf
+from pipelines.nerf.stereo.views import StereoView
+
 Labels = NDArray[np.int32]
 Floats = NDArray[np.float64]
 
@@ -23,6 +26,16 @@ def patches_of(picture: NDArray[np.float32]) -> Labels:
     found: Labels = felzenszwalb(
         _shown(picture), scale=_SCALE, sigma=_SIGMA, min_size=_LEAST_PX
     ).astype(np.int32)
+    return found
+
+
+def shelved_patches(view: StereoView, index: int, shelf: Shelf | None) -> Labels:
+    """`patches_of` a view's picture, found once where there is a shelf for them."""
+    if shelf is None:
+        return patches_of(view.picture)
+    if not shelf.has(index):
+        shelf[index] = patches_of(view.picture)
+    found: Labels = shelf[index]
     return found
 
 

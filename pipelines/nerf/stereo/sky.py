@@ -23,9 +23,8 @@ from pipelines.nerf.stereo.patch_colors import (
     Floats,
     PatchColors,
     grown,
-    patches_on,
 )
-from pipelines.nerf.stereo.patches import Labels
+from pipelines.nerf.stereo.patches import Labels, shelved_patches
 from pipelines.nerf.stereo.planes import ray_grid
 from pipelines.nerf.stereo.shelves import ByView, Shelf
 from pipelines.nerf.stereo.views import StereoView
@@ -81,7 +80,7 @@ def find_sky(
     """
     found, is_far = [], []
     for index, view in enumerate(views):
-        mask = like_sky(view, picture_of(index), up, points, patches_on(patches, index, view))
+        mask = like_sky(view, picture_of(index), up, points, shelved_patches(view, index, patches))
         z = depths[index]
         if mask.any() and (z > 0).any():
             ring = grown(mask, _RING_TO_PX) & ~grown(mask, _RING_FROM_PX) & (z > 0)

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from skimage.segmentation import expand_labels
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.completing import confirmed, shelved_patches
+from pipelines.nerf.stereo.completing import confirmed
 from pipelines.nerf.stereo.engines import KERNELS, Engine
 from pipelines.nerf.stereo.maps import MapShelf, Progress, depths_of, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
-from pipelines.nerf.stereo.patches import Labels, even_patches
+from pipelines.nerf.stereo.patches import Labels, even_patches, shelved_patches
 from pipelines.nerf.stereo.planes import (
     LEVEL,
     ON_PLANE,

@@ -47,7 +47,8 @@ def without(
     engine: Engine = KERNELS,
     shelves: Shelves = MEMORY,
 ) -> MapShelf:
-    """The maps with nothing where the masks are, nor where more neighbours see one than agree.
+    """The maps with nothing where the masks are, nor where more neighbours look through a depth
+    at what is masked in them than agree with it.
 
     masks: [H, W] of each view. Their pixels, but for those at their rims, have `VOID` for votes.
     on_share: told the share that is done; may raise.

@@ -80,6 +80,7 @@ SCENE = Scene(
     light=np.array([1.2, -1.8, 3.0]),
     subject=Region((-0.36, -0.30, 0.55), (0.36, 0.30, 1.05)),
     things=Region((-0.30, -0.25, PLINTH_M + 0.01), (0.30, 0.25, 1.05)),
+    beyond=0.5,
     reach=0.8 * BLACK_M,
 )
 

@@ -147,6 +147,26 @@ def test_a_textured_floor_stays_as_bent_as_its_pictures_say() -> None:
     assert np.linalg.svd(blind - blind.mean(axis=0), full_matrices=False)[1][2] < 1e-6
 
 
+def test_a_vertex_that_photos_are_sure_of_alone_does_not_stick_out() -> None:
+    """They have mistaken it for another; of five by five together they have not."""
+    points = sheet(0 * X, X, Y) - 0.5 * SIDE * STEP * (X + Y)
+    points[:, 2] += 0.02 * STEP * np.random.default_rng(0).normal(size=len(points))
+    square = np.arange(SIDE * SIDE).reshape(SIDE, SIDE)
+    alone = square[10:50:8, 10:50:8].ravel()
+    knob = square[53:58, 20:25].ravel()
+    answers = told(points, 1.0)
+    answers.offset[alone] = 1.5 * STEP
+    answers.offset[knob] = 0.4 * STEP
+    answers.half_pixel[knob] = 0.05 * STEP
+    rings = MeshRings(faces_of(SIDE), len(points))
+    parts = find_flat_parts(points, rings)
+    assert (parts.plane_of[np.concatenate([alone, knob])] != NOWHERE).all()
+    flat = flattened(points, parts, rings, answers)
+    height = (flat[:, 2] - np.median(flat[:, 2])) / STEP
+    assert np.abs(height[alone]).max() < 0.35
+    assert height[square[54:57, 21:24]].min() > 0.25
+
+
 def test_it_can_be_stopped_while_it_looks() -> None:
     bumpy, rings, _, _ = room(0.4)
 

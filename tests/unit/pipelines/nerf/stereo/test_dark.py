@@ -117,6 +117,18 @@ def test_what_a_sensor_measures_is_not_nothing() -> None:
     assert dark_of(seen, [None] * len(seen)).share > 0.5
 
 
+def test_a_black_thing_that_somebody_has_cut_out_stays() -> None:
+    """All that a mask leaves is at its border, and black."""
+    cut = []
+    for one in in_the_dark():
+        black = painted(one, one.what == ON_PILLAR, 0.02)
+        picture = np.where(one.what == ON_PILLAR, black.view.picture, np.float32(-1.0))
+        view = dataclasses.replace(black.view, picture=picture.astype(np.float32))
+        cut.append(dataclasses.replace(black, view=view))
+        assert like_dark(view, black.picture).mean() > 0.15
+    assert dark_of(cut).share == 0.0
+
+
 def test_points_that_others_look_past_are_not_solid() -> None:
     """At outlines depths are wrong, of what is lit, too."""
     seen = in_the_dark()
