@@ -186,12 +186,15 @@ def test_a_job_on_postgresql_and_s3_with_two_workers_in_two_homes(
         for number in (1, 2):
             engine.environment["NERFWORKS_HOME"] = str(tmp_path / f"home{number}")
             engine.start_worker(f"w{number}")
-        plan = {"mesh": {"steps": 10, "step_s": 0.2}, "video": {"steps": 10, "step_s": 0.2}}
+        met = engine.witness.parent / "met"  # neither ends before both have started
+        plan = {"mesh": {"until": str(met)}, "video": {"until": str(met)}}
         job_id = engine.submit({**plan, "train": {"steps": 20, "step_s": 0.1, "save_every": 4}})
+        engine.wait(lambda: engine.notes("mesh start") and engine.notes("video start"), 90)
+        met.touch()
         job = engine.wait_for(job_id, "succeeded", "failed", timeout_s=90)
         assert job.state == "succeeded", job.error
         pids = {line.split()[-1] for line in engine.notes("") if " start " in line}
-        assert len(pids) == 2, "mesh and video ran side by side"
+        assert len(pids) == 2, "each worker has a process of its own"
         report = engine.stage(job_id, "report").summary
         assert report is not None
         assert report["read"] == ["ingest", "train", "mesh", "video"]
