@@ -138,6 +138,13 @@ class PosesOptions(StageOptions):
         description="Below this share of registered images, poses are sought again, thoroughly: "
         "all pairs, then lower thresholds.",
     )
+    few_photos: int = Field(
+        40,
+        ge=0,
+        le=1000,
+        description="Of so many photos and fewer each counts: poses are sought again where one is "
+        "missing.",
+    )
     refine_principal_point: bool = Field(
         False, description="Fit the principal point too; needs many views."
     )

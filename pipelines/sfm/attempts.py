@@ -240,13 +240,15 @@ class Ladder:
         return self.outcome
 
     def _standing(self) -> Standing:
-        best = self.outcome.chosen
+        best, options = self.outcome.chosen, self._options
+        num = len(self._source.files)
+        is_few = not self._source.is_video and num <= options.few_photos
         return Standing(
-            len(self._source.files),
+            num,
             best.num_registered,
-            self._options.retry_below_ratio,
+            1.0 if is_few else options.retry_below_ratio,
             is_contradicted=best.is_contradicted,
-            is_film=self._source.is_video and self._options.matcher in ("auto", "sequential"),
+            is_film=self._source.is_video and options.matcher in ("auto", "sequential"),
         )
 
     def _matcher(self, wanted: Matches) -> str:

@@ -84,6 +84,16 @@ def turning_poses(num: int) -> np.ndarray:
     )
 
 
+def save_photos(root: Path, pictures: list[Image.Image]) -> None:
+    """A job's folder as the ingest stage leaves it."""
+    folder = root / "ingest" / "images"
+    folder.mkdir(parents=True)
+    images = [{"file": f"images/{index:02d}.jpg"} for index in range(len(pictures))]
+    for picture, image in zip(pictures, images, strict=True):
+        picture.save(root / "ingest" / image["file"], quality=95)
+    (root / "ingest" / "capture.json").write_text(json.dumps({"images": images}), "utf-8")
+
+
 def save_video_frames(root: Path, pictures: list[Image.Image]) -> None:
     """A job's folder as the frames stage leaves it, half a second between frames."""
     folder = root / "frames" / "images"

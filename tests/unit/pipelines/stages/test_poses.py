@@ -23,7 +23,9 @@ from pipelines.workspace import Workspace
 from tests.unit.pipelines.sfm.synthetic_room import (
     FOCAL,
     arc_poses,
+    pose_looking_at,
     render,
+    save_photos,
     save_video_frames,
     turning_poses,
 )
@@ -186,12 +188,7 @@ def test_where_too_few_register_colmaps_own_way_is_tried_and_kept_for_a_second_a
 
 def test_photos_in_no_order_are_matched_by_their_looks(tmp_path: Path) -> None:
     order = np.random.default_rng(0).permutation(16)
-    folder = tmp_path / "ingest" / "images"
-    folder.mkdir(parents=True)
-    for index, pose in enumerate(arc_poses(16)[order]):
-        render(pose).save(folder / f"{index:02d}.jpg", quality=95)
-    images = [{"file": f"images/{i:02d}.jpg"} for i in range(16)]
-    (tmp_path / "ingest" / "capture.json").write_text(json.dumps({"images": images}), "utf-8")
+    save_photos(tmp_path, [render(pose) for pose in arc_poses(16)[order]])
     options = OPTIONS.model_copy(update={"matcher": "retrieval", "retrieval_neighbours": 4})
     assert run(options, context(tmp_path))["num_registered"] == 16
     report = json.loads((tmp_path / ".partial/poses/report.json").read_text("utf-8"))
@@ -202,6 +199,19 @@ def test_photos_in_no_order_are_matched_by_their_looks(tmp_path: Path) -> None:
     move = similarity(poses[:, :, 3], truth[:, :, 3])
     errors = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - truth[:, :, 3], axis=1)
     assert errors.mean() < 0.01 * np.ptp(truth[:, :, 3], axis=0).max()
+
+
+@pytest.mark.parametrize(("few", "attempts"), [(8, 3), (7, 1)])
+def test_of_few_photos_each_is_sought(tmp_path: Path, few: int, attempts: int) -> None:
+    eye = np.array([2.2, 2.2, 1.4])
+    aside = pose_looking_at(eye, eye + np.array([0.3, -1.0, -0.25]))  # shows what no other does
+    save_photos(tmp_path, [render(pose) for pose in (*arc_poses(7), aside)])
+    options = OPTIONS.model_copy(
+        update={"few_photos": few, "upsample": "off", "num_features": 800, "min_registered": 5}
+    )
+    assert run(options, context(tmp_path))["registered_ratio"] == 7 / 8 > options.retry_below_ratio
+    report = json.loads((tmp_path / ".partial/poses/report.json").read_text("utf-8"))
+    assert len(report["attempts"]) == attempts
 
 
 def test_flat_pictures_have_no_features(tmp_path: Path) -> None:
