@@ -7,17 +7,28 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
-import open3d
 
 _SCALE = 1.1
+
+
+class _Nothing(ModuleType):
+    """A module in which there is whatever is asked for, and nothing of it works."""
+
+    def __getattr__(self, name: str) -> None:
+        return None
 
 
 def main(read: Path, written: Path) -> None:
     """Read points [P, 3], normals [P, 3], colors [P, 3] and the width of the finest cells; write
     the surface."""
+    # Open3D's plots are web pages, and importing what serves them takes as long as all the rest.
+    sys.modules["dash"] = _Nothing("dash")
+    import open3d
+
     geometry: Any = open3d.geometry
     vector: Any = open3d.utility.Vector3dVector
     with np.load(read) as given:
