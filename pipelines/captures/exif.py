@@ -1,10 +1,11 @@
 """What a photo's EXIF says of its lens: kept as data, while the picture itself loses all metadata.
 
 Kept, in `capture.json`: what tells lenses apart and gives their focal length (make, model, lens,
-focal lengths, width of the sensor), how the stored pixels were turned, and when the photo was taken
-by the camera's clock. Poses need the first for one camera model a lens and a focal length to start
-from. Everything else is dropped, above all what says where a photo was taken or by whose device:
-GPS, serial numbers, owner, thumbnails, the maker's notes. Numbers that no lens has are left out.
+focal lengths, width of the sensor), how the stored pixels were turned, which way was up, as far as
+the device had measured that, and when the photo was taken by the camera's clock. Poses need the
+first for one camera model a lens and a focal length to start from. Everything else is dropped,
+above all what says where a photo was taken or by whose device: GPS, serial numbers, owner,
+thumbnails, the rest of the maker's notes. Numbers that no lens has are left out.
 """
 
 from __future__ import annotations
@@ -17,11 +18,16 @@ from typing import Any
 
 import PIL.Image
 
+from pipelines.captures.attitude import Direction, measured_up
+
 # Tags of the Exif 2.32 standard.
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _TAKEN_AT, _FOCAL_MM, _FOCAL_35MM, _LENS = 0x9003, 0x920A, 0xA405, 0xA434
+_MAKERS_NOTE = 0x927C
 _PIXELS_X, _PIXELS_Y = 0xA002, 0xA003
 _PLANE_X, _PLANE_Y, _PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
+_ON_ITS_SIDE = 5
+"""The first of EXIF's orientations in which a picture is stored on its side."""
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _MOST_LETTERS = 64
 _MALFORMED = (SyntaxError, ValueError, TypeError, KeyError, struct.error, OSError, EOFError)
@@ -34,6 +40,7 @@ class Exif:
     focal_mm: of the lens. focal_35mm: that of a 36 x 24 mm camera with the same angle of view
     along the diagonal. sensor_mm: long side of the sensor that the picture covers.
     orientation: 1 to 8, of the pixels as sent. taken_at: "YYYY:MM:DD HH:MM:SS", the camera's clock.
+    up: the direction away from gravity, unit, as in `pipelines.captures.attitude`.
     """
 
     make: str | None = None
@@ -44,6 +51,7 @@ class Exif:
     sensor_mm: float | None = None
     orientation: int | None = None
     taken_at: str | None = None
+    up: Direction | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """What is known, as plain JSON."""
@@ -58,18 +66,43 @@ def read_exif(image: PIL.Image.Image) -> Exif:
             tags = image.getexif()
             detail = tags.get_ifd(_EXIF_IFD)
         orientation = tags.get(_ORIENTATION)
+        if orientation not in range(1, 9):
+            orientation = None
+        lens = _text(detail.get(_LENS))
+        up = _up(image, detail.get(_MAKERS_NOTE), orientation, lens)
         return Exif(
             make=_text(tags.get(_MAKE)),
             model=_text(tags.get(_MODEL)),
-            lens=_text(detail.get(_LENS)),
+            lens=lens,
             focal_mm=_length(detail.get(_FOCAL_MM)),
             focal_35mm=_length(detail.get(_FOCAL_35MM)),
             sensor_mm=_sensor(detail),
-            orientation=orientation if orientation in range(1, 9) else None,
+            orientation=orientation,
             taken_at=_text(detail.get(_TAKEN_AT)),
+            up=up,
         )
     except _MALFORMED:
         return Exif()
+
+
+def _up(
+    image: PIL.Image.Image, note: object, orientation: int | None, lens: str | None
+) -> Direction | None:
+    """The direction away from gravity in the upright picture, to four digits, or None."""
+    told = getattr(image, "info", {})
+    # libheif has turned its pictures already, and their EXIF calls them upright.
+    turned = told.get("original_orientation")
+    width, height = image.size
+    if turned is not None and turned >= _ON_ITS_SIDE:
+        width, height = height, width
+    up = measured_up(
+        note,
+        told.get("xmp"),
+        orientation=turned or orientation or 1,
+        is_wide=width > height,
+        lens=lens,
+    )
+    return None if up is None else (round(up[0], 4), round(up[1], 4), round(up[2], 4))
 
 
 def _text(value: Any) -> str | None:

@@ -8,6 +8,9 @@ A phone is held so that its picture is upright: the X axes of its cameras are le
 it is tipped up or down. The direction most orthogonal to all X axes is therefore vertical, even
 where every camera looks down. That is nerfstudio's `vertical` (cameras/camera_utils.py,
 auto_orient_and_center_poses), here with weights that make a few rolled cameras harmless.
+
+X axes that are all parallel say nothing: pictures of a floor, taken straight down one beside the
+other, are those of a wall. There only what the devices measured tells, which is asked first.
 """
 
 from __future__ import annotations
@@ -23,6 +26,10 @@ Array = npt.NDArray[np.float64]
 
 _MIN_TURN = 0.17
 """Below this root mean square of the second axis (about 10 degrees), X axes are parallel."""
+_FEWEST_MEASURED, _LEAST_MEASURED = 3, 0.25
+"""Cameras that must have measured which way is up, at least, and their share."""
+_SAME_UP_DEG, _MOST_SAME = 10.0, 0.75
+"""How near one another measured directions are that are the same, and how many of them must be."""
 _MIN_SIGN = 0.1
 """A mean camera axis this short along the vertical says nothing about which end is up."""
 
@@ -52,7 +59,7 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """How the world was turned and centred. up_from: vertical, camera_up or none.
+    """How the world was turned and centred. up_from: measured, vertical, camera_up or none.
 
     centered_on: focus (the point that the cameras look at) or centers (their mean).
     """
@@ -68,13 +75,17 @@ def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
     return flipped
 
 
-def find_up(world_from_camera: Array) -> tuple[Array, str]:
-    """The direction away from gravity, [3] unit, and how it was found: vertical or camera_up.
+def find_up(world_from_camera: Array, measured: Array | None = None) -> tuple[Array, str]:
+    """The direction away from gravity, [3] unit, and how it was found: measured, vertical or
+    camera_up.
 
+    measured: [N, 3], that direction in each camera's axes, where its device told it; NaN elsewhere.
     Raises ValueError where there are no cameras.
     """
     if len(world_from_camera) == 0:
         raise ValueError("no cameras to find the vertical from")
+    if measured is not None and (told := _agreed(world_from_camera, measured)) is not None:
+        return told, "measured"
     x_axes = world_from_camera[:, :, 0]
     mean_up: Array = world_from_camera[:, :, 1].mean(axis=0)
     _, singular, rows = np.linalg.svd(x_axes, full_matrices=True)
@@ -82,10 +93,29 @@ def find_up(world_from_camera: Array) -> tuple[Array, str]:
         up = _most_orthogonal(x_axes, rows[2])
         return up * _sign_of_up(up, world_from_camera), "vertical"
     level = mean_up - rows[0] * float(mean_up @ rows[0])
+    if np.linalg.norm(level) < _MIN_SIGN:
+        # Half of the pictures are upside down, as none of a wall are: all look down.
+        level = world_from_camera[:, :, 2].mean(axis=0)
     length = float(np.linalg.norm(level))
     if length < _MIN_SIGN:
         return np.array([0.0, 0.0, 1.0]), "camera_up"
     return level / length, "camera_up"
+
+
+def _agreed(world_from_camera: Array, measured: Array) -> Array | None:
+    """The direction, [3] unit, that most of the measured ones are in the world; None where too few
+    are known or they differ, as those of another camera's axes do once cameras turn."""
+    known = np.isfinite(measured).all(axis=1)
+    if known.sum() < max(_FEWEST_MEASURED, _LEAST_MEASURED * len(measured)):
+        return None
+    told = np.einsum("nij,nj->ni", world_from_camera[known][:, :, :3], measured[known])
+    near = np.cos(np.radians(_SAME_UP_DEG))
+    same = told @ told.T >= near
+    same = same[same.sum(axis=1).argmax()]
+    if same.mean() < _MOST_SAME:
+        return None
+    mean: Array = told[same].mean(axis=0)
+    return mean / np.linalg.norm(mean)
 
 
 def _most_orthogonal(axes: Array, start: Array) -> Array:
@@ -125,14 +155,19 @@ def rotation_to_z(up: Array) -> Array:
     return rotation
 
 
-def normalise(world_from_camera: Array, *, orient: bool = True) -> Normalisation:
+def normalise(
+    world_from_camera: Array, *, orient: bool = True, measured: Array | None = None
+) -> Normalisation:
     """The similarity that puts a reconstruction of unknown frame and scale into ours.
 
-    world_from_camera: [N, 3, 4], OpenGL axes. Afterwards gravity points along -Z (if `orient`),
-    the origin is the focus, or else the mean of the camera centres, and the largest absolute
-    coordinate of a camera centre is 1. Cameras in one single point keep their scale.
+    world_from_camera: [N, 3, 4], OpenGL axes. measured: as in `find_up`. Afterwards gravity points
+    along -Z (if `orient`), the origin is the focus, or else the mean of the camera centres, and the
+    largest absolute coordinate of a camera centre is 1. Cameras in one single point keep their
+    scale.
     """
-    up, up_from = find_up(world_from_camera) if orient else (np.array([0.0, 0.0, 1.0]), "none")
+    up, up_from = np.array([0.0, 0.0, 1.0]), "none"
+    if orient:
+        up, up_from = find_up(world_from_camera, measured)
     rotation = rotation_to_z(up)
     focus = find_focus(world_from_camera)
     centers = world_from_camera[:, :, 3]

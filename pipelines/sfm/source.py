@@ -22,6 +22,7 @@ from pipelines.workspace import Workspace
 _LENS_KEYS = ("make", "model", "lens", "focal_mm", "focal_35mm")
 """What of `pipelines.captures.exif.Exif` tells lenses apart."""
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
+UNKNOWN_UP = (math.nan, math.nan, math.nan)
 _FOCAL_RANGE = (0.2, 50.0)
 """Focal lengths that are believed, in long sides of the picture: a fisheye's to a telescope's."""
 _FEW_VIEWS = 5
@@ -58,6 +59,10 @@ class Source:
     def views_of(self, index: int) -> tuple[str, ...]:
         """The views cut from an image, which is a panorama then; none of any other."""
         return self.views[index] if self.views else ()
+
+    def up_of(self, index: int) -> tuple[float, ...]:
+        """Which way was up in an image, as measured (`pipelines.captures.attitude`), or NaN."""
+        return tuple((self.exif[index] if self.exif else {}).get("up", UNKNOWN_UP))
 
     def clip_name(self, index: int) -> str:
         """What the sender called the clip that an image is of; "" where it has no name."""

@@ -95,7 +95,7 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     ctx.progress(0.99, "writing the poses", 1.0)
     found = found_images(model, source)
     poses = opengl_from_opencv(found.world_from_camera)
-    world = normalise(poses, orient=options.orientation == "auto")
+    world = normalise(poses, orient=options.orientation == "auto", measured=found.up)
     notes = {"up_from": world.up_from, "centered_on": world.centered_on}
     write_cameras(ctx.out / "cameras.json", found, world, notes)
     write_sparse_points(ctx.out / SPARSE_POINTS, model, world)

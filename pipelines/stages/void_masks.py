@@ -37,7 +37,9 @@ def known_points(workspace: Workspace) -> Floats | None:
 
 def up_and_points(workspace: Workspace, capture: CamerasFile) -> tuple[Floats, Floats]:
     """What tells sky from other things: up [3], unit, and `known_points`, none without any."""
-    up, _ = find_up(np.array([image.world_from_camera for image in capture.images], np.float64))
+    up = np.array([0.0, 0.0, 1.0])
+    if capture.notes.get("up_from") != "measured":
+        up, _ = find_up(np.array([image.world_from_camera for image in capture.images], np.float64))
     points = known_points(workspace)
     return up, np.zeros((0, 3)) if points is None else points
 

@@ -116,6 +116,73 @@ def test_parallel_cameras_fall_back_to_their_own_up() -> None:
     np.testing.assert_allclose(back[:, :, 3].mean(axis=0), 0.0, atol=1e-9)
 
 
+def over_a_field(num: int = 12, turned: tuple[int, ...] = ()) -> np.ndarray:
+    """Cameras [num, 3, 4] that look straight down from height 3, side by side, all the same way but
+    for those that are turned by half."""
+    cameras = []
+    for index in range(num):
+        x = np.array([-1.0 if index in turned else 1.0, 0.0, 0.0])
+        z = np.array([0.0, 0.0, 1.0])
+        cameras.append(np.stack([x, np.cross(z, x), z, [index % 3, index // 3, 3.0]], axis=1))
+    return np.stack(cameras)
+
+
+def test_a_field_is_no_wall_where_the_drone_says_so() -> None:
+    cameras = moved(over_a_field(), 7)
+    down = np.tile([0.0, 0.0, 1.0], (12, 1))
+    up, found_by = find_up(cameras)
+    assert (found_by, round(angle_deg(up, random_rotation(7) @ [0, 0, 1]))) == ("camera_up", 90)
+    found = normalise(cameras, measured=down)
+    assert found.up_from == "measured"
+    back = found.similarity.apply_to_cameras(cameras)
+    np.testing.assert_allclose(back[:, 2, 2], 1.0, atol=1e-9)
+    np.testing.assert_allclose(back[:, 2, 3], back[0, 2, 3], atol=1e-9)
+
+
+def test_rows_that_are_flown_to_and_fro_are_over_a_field() -> None:
+    cameras = moved(over_a_field(turned=(3, 4, 5, 9, 10, 11)), 8)
+    up, _ = find_up(cameras)
+    assert angle_deg(up, random_rotation(8) @ [0, 0, 1]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("known", "noise", "found_by"),
+    [
+        (range(24), 0.0, "measured"),
+        (range(0, 24, 4), 0.03, "measured"),
+        (range(5), 0.0, "vertical"),  # too few
+        (range(24), 0.6, "vertical"),  # they contradict one another
+    ],
+)
+def test_what_devices_measured_is_believed_where_they_agree(
+    known: range, noise: float, found_by: str
+) -> None:
+    rng = np.random.default_rng(0)
+    truth = orbit()
+    measured = np.full((24, 3), np.nan)
+    measured[known] = truth[known][:, 2, :3] + rng.normal(scale=noise, size=(len(known), 3))
+    measured /= np.linalg.norm(measured, axis=1)[:, None]
+    up, told = find_up(moved(truth, 3), measured)
+    assert told == found_by
+    assert angle_deg(up, random_rotation(3) @ [0, 0, 1]) < 2.0
+
+
+def test_directions_in_axes_of_another_camera_are_not_believed() -> None:
+    truth = orbit()
+    aside = truth[:, 2, [1, 0, 2]]  # as if the picture lay on its side
+    _, told = find_up(moved(truth, 4), aside)
+    assert told == "vertical"
+
+
+def test_one_wrong_direction_in_five_is_left_out() -> None:
+    truth = orbit(num=20)
+    measured = truth[:, 2, :3].copy()
+    measured[::5] = [1.0, 0.0, 0.0]
+    up, told = find_up(moved(truth, 5), measured)
+    assert told == "measured"
+    assert angle_deg(up, random_rotation(5) @ [0, 0, 1]) < 1e-3
+
+
 def test_without_orientation_axes_stay_parallel() -> None:
     found = normalise(moved(orbit(), 6), orient=False)
     np.testing.assert_allclose(found.similarity.rotation, np.eye(3), atol=1e-12)

@@ -84,13 +84,23 @@ def turning_poses(num: int) -> np.ndarray:
     )
 
 
-def save_photos(root: Path, pictures: list[Image.Image]) -> None:
-    """A job's folder as the ingest stage leaves it."""
+def downward_poses(num: int) -> np.ndarray:
+    """[num, 3, 4]: side by side in the corner, straight down, none turned against another."""
+    down = np.stack([np.eye(3)] * num)
+    x, y = 0.5 + 0.25 * (np.arange(num) % 3), 0.5 + 0.25 * (np.arange(num) // 3)
+    return np.concatenate([down, np.stack([x, y, np.full(num, 1.6)], axis=1)[:, :, None]], axis=2)
+
+
+def save_photos(
+    root: Path, pictures: list[Image.Image], exif: dict[str, object] | None = None
+) -> None:
+    """A job's folder as the ingest stage leaves it. exif: what each photo's says."""
     folder = root / "ingest" / "images"
     folder.mkdir(parents=True)
-    images = [{"file": f"images/{index:02d}.jpg"} for index in range(len(pictures))]
-    for picture, image in zip(pictures, images, strict=True):
-        picture.save(root / "ingest" / image["file"], quality=95)
+    files = [f"images/{index:02d}.jpg" for index in range(len(pictures))]
+    for picture, file in zip(pictures, files, strict=True):
+        picture.save(root / "ingest" / file, quality=95)
+    images = [{"file": file, "exif": exif or {}} for file in files]
     (root / "ingest" / "capture.json").write_text(json.dumps({"images": images}), "utf-8")
 
 

@@ -23,6 +23,7 @@ from pipelines.workspace import Workspace
 from tests.unit.pipelines.sfm.synthetic_room import (
     FOCAL,
     arc_poses,
+    downward_poses,
     pose_looking_at,
     render,
     save_photos,
@@ -212,6 +213,19 @@ def test_of_few_photos_each_is_sought(tmp_path: Path, few: int, attempts: int) -
     assert run(options, context(tmp_path))["registered_ratio"] == 7 / 8 > options.retry_below_ratio
     report = json.loads((tmp_path / ".partial/poses/report.json").read_text("utf-8"))
     assert len(report["attempts"]) == attempts
+
+
+def test_photos_of_a_floor_lie_flat_where_the_camera_says_that_it_looked_down(
+    tmp_path: Path,
+) -> None:
+    exif: dict[str, object] = {"up": [0.0, 0.0, 1.0], "focal_35mm": 36.0 * FOCAL / 400}
+    save_photos(tmp_path, [render(pose) for pose in downward_poses(9)], exif)
+    assert run(OPTIONS, context(tmp_path))["num_registered"] == 9
+    cameras = CamerasFile.load(tmp_path / ".partial/poses/cameras.json")
+    assert cameras.notes["up_from"] == "measured"
+    poses = np.array([image.world_from_camera for image in cameras.images])
+    np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=0.01)
+    assert np.ptp(poses[:, 2, 3]) < 0.05 * np.ptp(poses[:, 0, 3])
 
 
 def test_flat_pictures_have_no_features(tmp_path: Path) -> None:
