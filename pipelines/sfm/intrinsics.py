@@ -16,13 +16,15 @@ The simplest model within the noise of the best is the rule of Breiman, Friedman
 difference.
 
 A focal length is weak where it can be changed much, all else adjusted, before the held-out error
-rises by that same `BENT_GAIN`; or where lenses that do equally well disagree on it.
+rises by that same `BENT_GAIN`; or where lenses that do equally well disagree on it. Then EXIF's is
+held, where there is one that the pictures do not contradict: lenses' makers know it within a few
+percent.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,6 +60,8 @@ _CAP = 5.0
 _STEP = 0.05
 """By which the focal length is changed to see what that does."""
 _MAX_SPREAD = 1.0
+MOST_RISE = 0.06
+"""By which the held-out error may rise where a weak focal length gives way to EXIF's."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,8 @@ class LensVerdict:
     """What was chosen for one camera, and why.
 
     focal_px: of the model that is kept. focal_spread: how far the focal length is open, as a share
-    of it to either side; None where too little is known to say.
+    of it to either side; None where too little is known to say. is_exif: whether it was weak, and
+    is EXIF's now.
     """
 
     num_images: int
@@ -97,6 +102,7 @@ class LensVerdict:
     focal_px: float
     focal_spread: float | None
     candidates: tuple[Candidate, ...]
+    is_exif: bool = False
 
     @property
     def is_weak(self) -> bool:
@@ -112,6 +118,7 @@ class LensVerdict:
             "why": self.why,
             "focal_px": round(self.focal_px, 2),
             "focal_spread_percent": spread,
+            "focal_from": "exif" if self.is_exif else "pictures",
             "candidates": [
                 {
                     "model": candidate.lens,
@@ -149,12 +156,16 @@ def unsettled(model: SparseModel) -> tuple[LensVerdict, ...]:
 
 
 def settle_lenses(
-    model: SparseModel, trials: LensTrials, wanted: str
+    model: SparseModel,
+    trials: LensTrials,
+    wanted: str,
+    priors_px: Mapping[int, float] | None = None,
 ) -> tuple[SparseModel, tuple[LensVerdict, ...]]:
     """The model with the lenses that the evidence is for, and what is known of each camera.
 
     wanted: `poses.camera_model`; other than auto, the lens stays as it was mapped and only its
-    focal length is looked at. The intrinsics are those of the camera with most images first.
+    focal length is looked at. priors_px: what EXIF says of the focal lengths of cameras, by their
+    place in the model. The intrinsics are those of the camera with most images first.
     """
     fits = [trials.fit(trials.cameras)]
     if wanted == AUTO:
@@ -170,13 +181,43 @@ def settle_lenses(
     lenses = best.lenses
     if lenses != trials.cameras:
         model = replace(trials.adopt(lenses), agreement=model.agreement)
-    moved = [trials.fit(lenses, start=best, focal_scale=1.0 + step) for step in (-_STEP, _STEP)]
+    moved = [
+        trials.fit(
+            lenses,
+            start=best,
+            focals_px={camera: focal * (1.0 + step) for camera, focal in best.focal_px.items()},
+        )
+        for step in (-_STEP, _STEP)
+    ]
     written = dict(zip(sorted(trials.cameras), model.cameras, strict=True))
     found = [
         _verdict_of(camera, written[camera], fits, best, moved, trials, wanted)
         for camera in sorted(trials.cameras, key=lambda i: -trials.num_views[i])
     ]
+    order = sorted(trials.cameras, key=lambda i: -trials.num_views[i])
+    ids = sorted(trials.cameras)
+    priors = {ids[place]: focal for place, focal in (priors_px or {}).items()}
+    weak = [camera for camera, verdict in zip(order, found, strict=True) if verdict.is_weak]
+    held = _held_by_exif(best, trials, {i: priors[i] for i in weak if i in priors})
+    if held:
+        model = replace(trials.adopt(lenses, {**best.focal_px, **held}), agreement=model.agreement)
+        found = [
+            replace(verdict, focal_px=held[camera], is_exif=True) if camera in held else verdict
+            for camera, verdict in zip(order, found, strict=True)
+        ]
     return model, tuple(found)
+
+
+def _held_by_exif(best: Fit, trials: LensTrials, priors: Mapping[int, float]) -> dict[int, float]:
+    """Those of EXIF's focal lengths, by camera id, that the held-out observations can live with."""
+    if not priors:
+        return {}
+    tried = trials.fit(best.lenses, start=best, focals_px={**best.focal_px, **priors})
+    return {
+        camera: focal
+        for camera, focal in priors.items()
+        if _gain(best, tried, trials, camera).share >= -MOST_RISE
+    }
 
 
 def _best_fit(fits: Sequence[Fit], trials: LensTrials) -> Fit:
@@ -337,5 +378,5 @@ def lens_warnings(lenses: Sequence[LensVerdict]) -> list[dict[str, Any]]:
             },
         }
         for found in lenses
-        if found.is_weak
+        if found.is_weak and not found.is_exif
     ]

@@ -17,6 +17,7 @@ from PIL import Image, UnidentifiedImageError
 from pipelines.errors import CaptureError
 from pipelines.scene.panoramas import MODEL as PANORAMA
 from pipelines.tools.colmap import CameraGroup
+from pipelines.tools.colmap_results import SparseModel
 from pipelines.workspace import Workspace
 
 _LENS_KEYS = ("make", "model", "lens", "focal_mm", "focal_35mm")
@@ -25,6 +26,8 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 UNKNOWN_UP = (math.nan, math.nan, math.nan)
 _FOCAL_RANGE = (0.2, 50.0)
 """Focal lengths that are believed, in long sides of the picture: a fisheye's to a telescope's."""
+_WIDE = 1.6
+"""Sides' ratio beyond which a picture is taken to be a part of a sensor of 4:3."""
 _FEW_VIEWS = 5
 """A lens seen by fewer images gets one radial coefficient: more would fit noise."""
 
@@ -163,16 +166,32 @@ def prior_focal_px(exif: Mapping[str, Any], width: int, height: int) -> float | 
     """The focal length in pixels of a picture of that size, by its EXIF; None where it is silent.
 
     From the 35 mm equivalent, which compares diagonals (CIPA DCG-001), else from the focal length
-    and the sensor's long side. Values that no camera has are not believed.
+    and the sensor's long side. Phones and drones write the same equivalent into 16:9 pictures, cut
+    out of their sensors' 4:3, so there it is that diagonal. Values that no camera has are not
+    believed.
     """
-    long_side = max(width, height)
+    long_side, short_side = max(width, height), min(width, height)
     if exif.get("focal_35mm"):
-        focal = exif["focal_35mm"] / _DIAGONAL_35MM * math.hypot(width, height)
+        whole = 0.75 * long_side if long_side > _WIDE * short_side else short_side
+        focal = exif["focal_35mm"] / _DIAGONAL_35MM * math.hypot(long_side, whole)
     elif exif.get("focal_mm") and exif.get("sensor_mm"):
         focal = exif["focal_mm"] / exif["sensor_mm"] * long_side
     else:
         return None
     return focal if _FOCAL_RANGE[0] <= focal / long_side <= _FOCAL_RANGE[1] else None
+
+
+def prior_focals_px(model: SparseModel, source: Source) -> dict[int, float]:
+    """What EXIF says of the focal lengths of a model's cameras, by their index; without those of
+    which it says nothing."""
+    found: dict[int, float] = {}
+    if source.exif:
+        for image, camera in zip(model.indices, model.camera_of, strict=True):
+            lens = model.cameras[camera]
+            focal = prior_focal_px(source.exif[image], lens.width, lens.height)
+            if focal is not None:
+                found.setdefault(camera, focal)
+    return found
 
 
 def _group(indices: Sequence[int], lens: str, focal_px: float | None) -> CameraGroup:

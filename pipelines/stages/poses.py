@@ -29,7 +29,7 @@ from pipelines.sfm.found_images import FoundImages, found_images
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled
 from pipelines.sfm.report import build_report, check_usable, report_of_failure, report_of_model
 from pipelines.sfm.rungs import RUNGS
-from pipelines.sfm.source import Source, read_source
+from pipelines.sfm.source import Source, prior_focals_px, read_source
 from pipelines.sfm.subpixel import refine_model
 from pipelines.stage import StageContext
 from pipelines.stages.given_poses import run_given
@@ -91,7 +91,7 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         if source.has_panoramas:
             lenses = unsettled(model)
         else:
-            model, lenses = _settle_lenses(reconstructor, model, options, ctx)
+            model, lenses = _settle_lenses(reconstructor, model, source, options, ctx)
     ctx.progress(0.99, "writing the poses", 1.0)
     found = found_images(model, source)
     poses = opengl_from_opencv(found.world_from_camera)
@@ -154,7 +154,11 @@ def _refine(
 
 
 def _settle_lenses(
-    reconstructor: Reconstructor, model: SparseModel, options: PosesOptions, ctx: StageContext
+    reconstructor: Reconstructor,
+    model: SparseModel,
+    source: Source,
+    options: PosesOptions,
+    ctx: StageContext,
 ) -> tuple[SparseModel, tuple[LensVerdict, ...]]:
     """The model with the lenses that fit it best, and what is known of each camera."""
     trials = reconstructor.lens_trials(
@@ -162,13 +166,16 @@ def _settle_lenses(
         lambda rounds: ctx.progress(0.98 + 0.01 * share_done(rounds), "fitting the lens"),
         refine_principal_point=options.refine_principal_point,
     )
-    settled, lenses = settle_lenses(model, trials, options.camera_model)
+    settled, lenses = settle_lenses(
+        model, trials, options.camera_model, prior_focals_px(model, source)
+    )
     for found in lenses:
         ctx.logger.info(
-            "%d images: %s, focal length %.1f px (%s)",
+            "%d images: %s, focal length %.1f px%s (%s)",
             found.num_images,
             found.lens,
             found.focal_px,
+            " by EXIF" if found.is_exif else "",
             found.why,
         )
     for warning in lens_warnings(lenses):

@@ -128,21 +128,15 @@ class LensTrials:
         lenses: Mapping[int, str],
         *,
         start: Fit | None = None,
-        focal_scale: float | None = None,
+        focals_px: Mapping[int, float] | None = None,
     ) -> Fit:
         """Adjust the tracks with these lenses, from what mapping found or from another fit.
 
-        focal_scale: multiply the focal lengths and hold them; None fits them.
+        focals_px: by camera id, to be held; None fits them.
         """
         fitted = copy.deepcopy(self._part if start is None else start.reconstruction)
-        for camera_id, lens in lenses.items():
-            camera = fitted.camera(camera_id)
-            change_lens(camera, lens)
-            if focal_scale is not None:
-                params = np.array(camera.params)
-                params[list(camera.focal_length_idxs())] *= focal_scale
-                camera.params = params
-        self._adjust(fitted, refine_focal=focal_scale is None)
+        _change_lenses(fitted, lenses, focals_px)
+        self._adjust(fitted, refine_focal=focals_px is None)
         cameras = {i: fitted.camera(i) for i in lenses}
         return Fit(
             lenses=dict(lenses),
@@ -154,12 +148,13 @@ class LensTrials:
             reconstruction=fitted,
         )
 
-    def adopt(self, lenses: Mapping[int, str]) -> SparseModel:
-        """The whole model, adjusted once more with these lenses."""
+    def adopt(
+        self, lenses: Mapping[int, str], focals_px: Mapping[int, float] | None = None
+    ) -> SparseModel:
+        """The whole model, adjusted once more with these lenses. focals_px: as in `fit`."""
         whole = copy.deepcopy(self._whole)
-        for camera_id, lens in lenses.items():
-            change_lens(whole.camera(camera_id), lens)
-        self._adjust(whole, refine_focal=True)
+        _change_lenses(whole, lenses, focals_px)
+        self._adjust(whole, refine_focal=focals_px is None)
         whole.update_point_3d_errors()
         return sparse_model(whole, self._folder)
 
@@ -233,6 +228,19 @@ def _part_of(whole: Any, image_ids: Sequence[int]) -> Any:
         if tracks[point_id].length() >= MIN_SEEN:
             part.add_point3D(whole.point3D(point_id).xyz, tracks[point_id])
     return part
+
+
+def _change_lenses(
+    model: Any, lenses: Mapping[int, str], focals_px: Mapping[int, float] | None
+) -> None:
+    for camera_id, lens in lenses.items():
+        camera = model.camera(camera_id)
+        change_lens(camera, lens)
+        if focals_px is not None:
+            params = np.array(camera.params)
+            scale = focals_px[camera_id] / float(camera.mean_focal_length())
+            params[list(camera.focal_length_idxs())] *= scale
+            camera.params = params
 
 
 def change_lens(camera: Any, lens: str) -> None:

@@ -34,6 +34,8 @@ _MIN_VIEWS = 2
 """A place that one view alone shows is not believed."""
 MOST_POINTS = 2_000_000
 """Points for which there is room; cubes become larger where there would be more."""
+LARGE = 10_000
+"""Points from which the solver gets a process of its own, whose start takes a second."""
 _COARSER = 1.05
 _STRAY_CUBES = 2.0
 """The surface ends so many cubes from the nearest point."""
@@ -101,12 +103,15 @@ def reconstruct(
         "colors": cloud.colors.astype(np.float64) / 255.0,
         "width": np.float64(side),
     }
-    solved = run_apart(
-        poisson_solver.__file__,
-        given,
-        _USUAL_S * len(cloud),
-        lambda done: on_progress(_ORIENTED_SHARE + (_SOLVED_SHARE - _ORIENTED_SHARE) * done),
-    )
+    if len(cloud) < LARGE:
+        solved = poisson_solver.solved(given)
+    else:
+        solved = run_apart(
+            poisson_solver.__file__,
+            given,
+            _USUAL_S * len(cloud),
+            lambda done: on_progress(_ORIENTED_SHARE + (_SOLVED_SHARE - _ORIENTED_SHARE) * done),
+        )
     on_progress(_SOLVED_SHARE)
     made = TriangleMesh(
         solved["vertices"], solved["faces"], solved["colors"], np.zeros_like(solved["vertices"])

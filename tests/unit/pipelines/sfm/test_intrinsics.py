@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +31,13 @@ SKEWED: Lens = ("OPENCV", (520.0, 500.0, *CENTER, -0.05, 0.02, 0.004, -0.003))
 
 
 def settle(
-    trials: LensTrials, folder: Path, wanted: str = AUTO
+    trials: LensTrials,
+    folder: Path,
+    wanted: str = AUTO,
+    priors_px: Mapping[int, float] | None = None,
 ) -> tuple[SparseModel, tuple[LensVerdict, ...]]:
-    return settle_lenses(sparse_model(pycolmap.Reconstruction(folder), folder), trials, wanted)
+    model = sparse_model(pycolmap.Reconstruction(folder), folder)
+    return settle_lenses(model, trials, wanted, priors_px)
 
 
 @pytest.mark.parametrize("truth", [SIMPLE, RADIAL, SKEWED], ids=lambda lens: lens[0])
@@ -70,6 +75,36 @@ def test_a_short_arc_leaves_the_focal_length_open_and_says_so(tmp_path: Path) ->
     assert strong.focal_spread is not None
     assert strong.focal_spread < 0.05
     assert lens_warnings([strong]) == []
+
+
+def test_a_focal_length_left_open_is_exifs_unless_pictures_contradict_that(tmp_path: Path) -> None:
+    narrow = trials_of(tmp_path, [SIMPLE], arc_deg=3, depth=0.1, swing=0.0)
+    own, (weak,) = settle(narrow, tmp_path)
+    assert not weak.is_exif
+    model, (found,) = settle(narrow, tmp_path, priors_px={0: 530.0})
+    assert found.is_exif
+    assert found.as_dict()["focal_from"] == "exif"
+    assert lens_warnings([found]) == []
+    assert found.focal_px == model.cameras[0].fl_x == pytest.approx(530.0)
+    assert own.cameras[0].fl_x != pytest.approx(530.0, rel=0.005)
+    assert model.error_px < 0.6
+    model, (found,) = settle(narrow, tmp_path, priors_px={0: 5200.0})
+    assert not found.is_exif
+    assert model.cameras[0].fl_x == own.cameras[0].fl_x
+
+
+def test_a_focal_length_that_pictures_know_stays_theirs(tmp_path: Path) -> None:
+    wide = trials_of(tmp_path, [SIMPLE], arc_deg=70)
+    model, (found,) = settle(wide, tmp_path, priors_px={0: 540.0})
+    assert not found.is_exif
+    assert model.cameras[0].fl_x == pytest.approx(520.0, rel=0.005)
+
+
+def test_of_two_cameras_only_the_one_with_exif_is_held(tmp_path: Path) -> None:
+    narrow = trials_of(tmp_path, [SIMPLE, SIMPLE], arc_deg=3, depth=0.1, swing=0.0, num_images=20)
+    model, found = settle(narrow, tmp_path, priors_px={1: 530.0})
+    assert sorted(each.is_exif for each in found) == [False, True]
+    assert model.cameras[1].fl_x == pytest.approx(530.0)
 
 
 def test_cameras_are_judged_one_by_one(tmp_path: Path) -> None:

@@ -149,6 +149,7 @@ def test_photos_taken_upright_have_the_same_focal_length(tmp_path: Path) -> None
     ("exif", "focal_px"),
     [
         ({"focal_mm": 50.0, "sensor_mm": 36.0}, 50 / 36 * 3000),
+        ({"focal_35mm": 50.0}, 50 / 36 * 3000),
         ({"focal_mm": 50.0}, None),
         ({"focal_35mm": 1.0}, None),  # a tenth of a fisheye's
         ({"focal_mm": 400.0, "sensor_mm": 1.0}, None),
@@ -158,6 +159,12 @@ def test_photos_taken_upright_have_the_same_focal_length(tmp_path: Path) -> None
 def test_focal_length_in_pixels(exif: dict[str, float], focal_px: float | None) -> None:
     assert prior_focal_px(exif, 3000, 2000) == (focal_px and pytest.approx(focal_px))
     assert prior_focal_px(exif, 2000, 3000) == (focal_px and pytest.approx(focal_px))
+
+
+def test_a_drones_wide_picture_is_a_part_of_its_sensor() -> None:
+    """3.61 mm behind a sensor of 6.17 mm, which is called 20 mm."""
+    assert prior_focal_px({"focal_35mm": 20.0}, 4000, 2250) == pytest.approx(2340, rel=0.02)
+    assert prior_focal_px({"focal_35mm": 20.0}, 4000, 3000) == pytest.approx(2340, rel=0.02)
 
 
 def test_frames_without_a_time_are_taken_in_their_order(tmp_path: Path) -> None:
