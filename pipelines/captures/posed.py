@@ -95,7 +95,8 @@ def write_posed(
     cameras: dict[Intrinsics, int] = {}
     poses = np.array([item.world_from_camera for item in stored], np.float64)
     orientations = [item.picture.exif.orientation for item in stored]
-    move = settled(poses, orientations, capture.up, capture.notes)
+    measured = [item.picture.exif.up for item in stored]
+    move = settled(poses, orientations, capture.up, capture.notes, measured)
     poses = move.poses(poses)
     images = tuple(
         PosedImage(

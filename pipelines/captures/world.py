@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipelines.captures.attitude import Direction
 from pipelines.captures.contents import Up
 from pipelines.scene.orientation import find_up, rotation_to_z
 
@@ -25,7 +26,7 @@ _CLEARLY = 0.8
 """Cosine up to which an axis of the world is the vertical, and nothing else is."""
 _SIDEWAYS = 0.7
 """Mean height of the cameras' X axes above which pictures may be upright ones stored sideways."""
-_LEANS = {"vertical": 0.94, "camera_up": 0.5}
+_LEANS = {"measured": 0.94, "vertical": 0.94, "camera_up": 0.5}
 """Cosine between +Z and the vertical, by how that was found, below which a world without a known
 one is turned. A world that stands already, as one that we wrote, stays as it is."""
 _FAR = 100.0
@@ -66,10 +67,12 @@ def settled(
     orientations: Sequence[int | None],
     up: Up,
     notes: Mapping[str, Any],
+    measured: Sequence[Direction | None] = (),
 ) -> Move:
     """How a world is to be moved; not at all where nothing asks for it.
 
     orientations: N, EXIF's, of the pixels as stored. up: what is known of the world's vertical.
+    measured: N, which way was up in each picture as it is viewed, where its device told that.
     notes: of the world as it came; `applied_transform` and `applied_scale` of it are heeded.
     """
     told: list[str] = []
@@ -80,7 +83,10 @@ def settled(
         changed["up"] = axis
         told.append(f"In the pictures {axis} of the file's world is up, not +Z: it was turned.")
     elif up == "unknown":
-        vertical, found_by = find_up(as_viewed(world_from_camera, orientations))
+        told_up = [(np.nan,) * 3 if one is None else one for one in measured]
+        vertical, found_by = find_up(
+            as_viewed(world_from_camera, orientations), np.array(told_up) if told_up else None
+        )
         changed["up_from"] = found_by
         if vertical[2] < _LEANS[found_by]:
             rotation = rotation_to_z(vertical)

@@ -113,6 +113,24 @@ def test_an_unknown_vertical_is_found_however_pictures_are_stored(
     assert settled(lying, [orientation] * len(lying), "known", {}).notes == {}
 
 
+@pytest.mark.parametrize("orientation", [None, 6])
+def test_a_world_of_which_only_devices_know_up_is_turned_as_they_say(
+    orientation: int | None,
+) -> None:
+    """A drone's pictures, straight down, and a world that has them look along its Y axis."""
+    poses = np.stack([np.eye(3, 4)] * 9)
+    poses[:, :2, 3] = [(x, y) for x in range(3) for y in range(3)]
+    if orientation is not None:
+        poses[:, :, :3] = poses[:, :, :3] @ np.array(STORED[orientation])
+    lying = leaning(90.0) @ poses
+    unknown = settled(lying, [orientation] * 9, "unknown", {})
+    assert unknown.notes["up_from"] == "camera_up"
+    move = settled(lying, [orientation] * 9, "unknown", {}, [(0.0, 0.0, 1.0)] * 8 + [None])
+    assert move.notes["up_from"] == "measured"
+    np.testing.assert_allclose(move.poses(lying)[:, 2, 2], 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.ptp(move.poses(lying)[:, 2, 3]), 0.0, atol=1e-9)
+
+
 def test_map_coordinates_are_brought_near_in_double_precision() -> None:
     truth = walked()
     away = truth.copy()
