@@ -17,7 +17,7 @@ from pipelines.exports import mesh_shape
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
-from pipelines.exports.surface import poisson_solver, tsdf
+from pipelines.exports.surface import poisson, poisson_solver, tsdf
 from pipelines.exports.surface.borders import border_loops
 from pipelines.exports.surface.surface_file import SURFACE
 from pipelines.exports.texture import charts
@@ -105,6 +105,7 @@ def test_there_is_a_mesh_also_where_the_solver_fails(
     job: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(poisson_solver, "__file__", "/nowhere/poisson_solver.py")
+    monkeypatch.setattr(poisson, "LARGE", 0)
     summary = tiny_job.run(job, "mesh", method="poisson", texture="none")["summary"]
     assert summary["method"] == "tsdf"
     assert summary["num_faces"] > 500
