@@ -11,6 +11,7 @@ the lens, errors are angles, told in diagonals of the picture as they are near i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,12 @@ NEAR = 4e-3
 pixels, which is as much of a picture of 960."""
 LITTLE = 0.5
 """Agreement below which poses are in doubt."""
+MUCH = 0.8
+"""Agreement from which what is left of a model is right, once single images are taken out."""
+_FEWEST_OF_IMAGE = 2
+"""Pairs of an image below which nothing is said of it alone."""
+_MOST_WRONG = 0.25
+"""Share of the images that may be wrong in a model that is right."""
 MOST_PAIRS, MOST_MATCHES = 2000, 60
 """Looked at, evenly picked."""
 FEWEST_PAIRS, FEWEST_MATCHES = 3, 15
@@ -106,21 +113,68 @@ def agreement(
     indices: [N], the image that each pose is of. world_from_camera: [N, 3, 4], OpenCV axes.
     lenses: [N]. Pairs with few matches count less.
     """
-    row = {index: number for number, index in enumerate(indices)}
-    shares, weights = [], []
-    for (i, j), places in matches.items():
-        if i not in row or j not in row or len(places[0]) < FEWEST_MATCHES:
-            continue
-        a, b = row[i], row[j]
-        fits = fitting((world_from_camera[a], world_from_camera[b]), (lenses[a], lenses[b]), places)
-        shares.append(float(fits.mean()))
-        weights.append(min(len(fits), _FULL_WEIGHT))
-    if len(shares) < FEWEST_PAIRS:
+    pairs = _of_pairs(indices, world_from_camera, lenses, matches)
+    if len(pairs) < FEWEST_PAIRS:
         return None
-    return float(np.average(shares, weights=weights))
+    return _mean(pairs)
 
 
 def agreement_of_model(model: SparseModel, matches: Matches) -> float | None:
     """The same of a model."""
     lenses = [model.cameras[number] for number in model.camera_of]
     return agreement(model.indices, model.world_from_camera, lenses, matches)
+
+
+def contradicted_images(model: SparseModel, matches: Matches) -> tuple[int, ...]:
+    """Those of a model's images, ascending, whose own matches say that they stand elsewhere.
+
+    The worst is taken out first: its pairs speak against its neighbours, too. None where they would
+    be many, or where matches contradict the model without them: nobody knows which are right.
+    """
+    lenses = [model.cameras[number] for number in model.camera_of]
+    pairs = _of_pairs(model.indices, model.world_from_camera, lenses, matches)
+    wrong: list[int] = []
+    while len(wrong) <= _MOST_WRONG * len(model.indices):
+        own: dict[int, list[_Pair]] = {}
+        for pair in pairs:
+            for image in pair.images:
+                own.setdefault(image, []).append(pair)
+        known = {o: _mean(found) for o, found in own.items() if len(found) >= _FEWEST_OF_IMAGE}
+        worst = min(known, key=lambda image: (known[image], image), default=None)
+        if worst is None or known[worst] >= LITTLE:
+            is_right = len(pairs) >= FEWEST_PAIRS and _mean(pairs) >= MUCH
+            return tuple(sorted(wrong)) if is_right else ()
+        wrong.append(worst)
+        pairs = [pair for pair in pairs if worst not in pair.images]
+    return ()
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two images with poses. share: of their matches, those that fit. weight: what they count."""
+
+    images: tuple[int, int]
+    share: float
+    weight: int
+
+
+def _of_pairs(
+    indices: Sequence[int],
+    world_from_camera: Floats,
+    lenses: Sequence[Intrinsics],
+    matches: Matches,
+) -> list[_Pair]:
+    row = {index: number for number, index in enumerate(indices)}
+    found = []
+    for (i, j), places in matches.items():
+        if i not in row or j not in row or len(places[0]) < FEWEST_MATCHES:
+            continue
+        a, b = row[i], row[j]
+        fits = fitting((world_from_camera[a], world_from_camera[b]), (lenses[a], lenses[b]), places)
+        found.append(_Pair((i, j), float(fits.mean()), min(len(fits), _FULL_WEIGHT)))
+    return found
+
+
+def _mean(pairs: Sequence[_Pair]) -> float:
+    """The share of matches that fit."""
+    return float(np.average([o.share for o in pairs], weights=[o.weight for o in pairs]))

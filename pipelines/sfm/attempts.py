@@ -18,7 +18,12 @@ from pathlib import Path
 
 from pipelines.options import PosesOptions
 from pipelines.scene.panoramas import MODEL as PANORAMA
-from pipelines.sfm.agreement import MOST_MATCHES, MOST_PAIRS, agreement_of_model
+from pipelines.sfm.agreement import (
+    MOST_MATCHES,
+    MOST_PAIRS,
+    agreement_of_model,
+    contradicted_images,
+)
 from pipelines.sfm.intrinsics import AUTO, FISHEYE, mapping_lens
 from pipelines.sfm.key_frames import (
     clips_of_keys,
@@ -50,7 +55,13 @@ from pipelines.tools.colmap import (
     extraction_threads,
 )
 from pipelines.tools.colmap_placing import num_tidying_steps
-from pipelines.tools.colmap_results import PairStatistics, best_model
+from pipelines.tools.colmap_results import (
+    PairStatistics,
+    SparseModel,
+    VerifiedMatches,
+    best_model,
+    without_images,
+)
 
 NUM_PROBES = 5
 """Images, spread over the capture, whose features are counted before the rest."""
@@ -425,6 +436,7 @@ class Ladder:
         compared(1)
         seen = self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES)
         compared(2)
+        models = [self._believed(model, seen) for model in models]
         models = [replace(model, agreement=agreement_of_model(model, seen)) for model in models]
         compared(3)
         attempt = Attempt(rung, matcher, tuple(models), time.monotonic() - began)
@@ -439,6 +451,17 @@ class Ladder:
             [len(model.indices) for model in models],
             [None if model.agreement is None else round(model.agreement, 3) for model in models],
         )
+
+    def _believed(self, model: SparseModel, seen: VerifiedMatches) -> SparseModel:
+        """A model without the images that stand where their own matches say that they do not."""
+        wrong = contradicted_images(model, seen)
+        if not wrong:
+            return model
+        self._ctx.logger.info(
+            "left out as their matches contradict their poses: %s",
+            ", ".join(self._source.files[index] for index in wrong),
+        )
+        return without_images(model, wrong)
 
 
 def _spans(num: int) -> list[Span]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -291,6 +291,20 @@ def sparse_model(reconstruction: Any, stored: Path | None = None) -> SparseModel
         angle_deg=_median_widest_angle_deg(points, center_of),
         stored=stored,
     )
+
+
+def without_images(model: SparseModel, indices: Sequence[int]) -> SparseModel:
+    """A model that COLMAP wrote without some of its images and what only they saw; there, too."""
+    if model.stored is None:
+        raise ValueError("the model was not written by COLMAP")
+    reconstruction = pycolmap.Reconstruction(model.stored)
+    for image_id in list(reconstruction.reg_image_ids()):
+        image = reconstruction.image(image_id)
+        if image_index(image.name) in indices:
+            reconstruction.deregister_frame(image.frame_id)
+    reconstruction.update_point_3d_errors()
+    reconstruction.write(model.stored)
+    return replace(sparse_model(reconstruction, model.stored), agreement=model.agreement)
 
 
 def _median_widest_angle_deg(

@@ -16,6 +16,7 @@ from pipelines.sfm.agreement import (
     Matches,
     agreement,
     agreement_of_model,
+    contradicted_images,
     fitting,
 )
 from pipelines.sfm.report import Attempt, Outcome, check_usable, doubts_of
@@ -204,3 +205,13 @@ def test_of_attempts_about_as_good_the_first_is_taken() -> None:
     first, second = (replace(model(RIGHT, 600, 0.8), agreement=value) for value in (0.95, 0.96))
     outcome = Outcome((attempt(0, first), attempt(1, second)), PairStatistics.nothing(NUM))
     assert outcome.chosen.best is first
+
+
+def test_an_image_that_stands_elsewhere_is_told_from_a_model_that_is_wrong() -> None:
+    astray = RIGHT.copy()
+    astray[[4, 20]] = ring(ALL_AROUND[[4, 20]] + 25.0)
+    assert contradicted_images(model(astray, 600, 0.8), MATCHES) == (4, 20)
+    assert contradicted_images(model(RIGHT, 600, 0.8), MATCHES) == ()
+    assert contradicted_images(model(TWISTED, 600, 0.8), MATCHES) == (), "who knows which"
+    few = {pair: found for pair, found in MATCHES.items() if 4 not in pair or pair == (4, 5)}
+    assert contradicted_images(model(astray, 600, 0.8), few) == (20,), "one pair says little"

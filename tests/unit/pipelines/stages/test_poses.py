@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -18,7 +19,13 @@ from pipelines.scene.cameras_file import CamerasFile
 from pipelines.sfm.rungs import RUNGS
 from pipelines.stage import StageContext
 from pipelines.stages.poses import run
-from pipelines.tools.colmap_results import read_statistics
+from pipelines.tools.colmap import Reconstructor
+from pipelines.tools.colmap_results import (
+    SparseModel,
+    image_index,
+    read_statistics,
+    sparse_model,
+)
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.sfm.synthetic_room import (
     FOCAL,
@@ -213,6 +220,40 @@ def test_of_few_photos_each_is_sought(tmp_path: Path, few: int, attempts: int) -
     assert run(options, context(tmp_path))["registered_ratio"] == 7 / 8 > options.retry_below_ratio
     report = json.loads((tmp_path / ".partial/poses/report.json").read_text("utf-8"))
     assert len(report["attempts"]) == attempts
+
+
+def test_an_image_that_was_placed_wrong_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    mapped = Reconstructor.map
+
+    def astray(self: Reconstructor, *given: Any) -> list[SparseModel]:
+        """As COLMAP maps, but for the third image, which it turns by 30 degrees."""
+        (model,) = mapped(self, *given)
+        assert model.stored is not None
+        whole = pycolmap.Reconstruction(model.stored)
+        (image,) = [each for each in whole.images.values() if image_index(each.name) == 2]
+        turn = pycolmap.Rotation3d(np.array([0.0, np.sin(0.26), 0.0, np.cos(0.26)]))
+        pose = image.cam_from_world()
+        image.frame.rig_from_world = pycolmap.Rigid3d(turn * pose.rotation, pose.translation)
+        whole.write(model.stored)
+        return [sparse_model(whole, model.stored)]
+
+    monkeypatch.setattr(Reconstructor, "map", astray)
+    save_video_frames(tmp_path, [render(pose) for pose in arc_poses(10)])
+    with caplog.at_level("INFO"):
+        assert run(OPTIONS, context(tmp_path))["num_registered"] == 9
+    assert "their matches contradict their poses: images/frame_00003.jpg" in caplog.text
+    cameras = CamerasFile.load(tmp_path / ".partial/poses/cameras.json")
+    assert "images/frame_00003.jpg" not in [image.file for image in cameras.images]
+    report = json.loads((tmp_path / ".partial/poses/report.json").read_text("utf-8"))
+    (left,) = report["unregistered"]
+    assert (left["file"], left["code"]) == ("images/frame_00003.jpg", "pose_rejected")
+    poses = np.array([image.world_from_camera for image in cameras.images])
+    truth = np.delete(arc_poses(10), 2, axis=0)
+    move = similarity(poses[:, :, 3], truth[:, :, 3])
+    errors = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - truth[:, :, 3], axis=1)
+    assert errors.max() < 0.02 * np.ptp(truth[:, :, 3], axis=0).max()
 
 
 def test_photos_of_a_floor_lie_flat_where_the_camera_says_that_it_looked_down(
