@@ -30,6 +30,9 @@ _FEWEST_MEASURED, _LEAST_MEASURED = 3, 0.25
 """Cameras that must have measured which way is up, at least, and their share."""
 _SAME_UP_DEG, _MOST_SAME = 10.0, 0.75
 """How near one another measured directions are that are the same, and how many of them must be."""
+_MANY_UPSIDE_DOWN = 0.25
+"""Share of cameras, their X axes parallel, that are upside down against the others where a drone
+flies to and fro; fewer are pictures of a wall that lost how they were held."""
 _MIN_SIGN = 0.1
 """A mean camera axis this short along the vertical says nothing about which end is up."""
 
@@ -93,13 +96,19 @@ def find_up(world_from_camera: Array, measured: Array | None = None) -> tuple[Ar
         up = _most_orthogonal(x_axes, rows[2])
         return up * _sign_of_up(up, world_from_camera), "vertical"
     level = mean_up - rows[0] * float(mean_up @ rows[0])
-    if np.linalg.norm(level) < _MIN_SIGN:
-        # Half of the pictures are upside down, as none of a wall are: all look down.
-        level = world_from_camera[:, :, 2].mean(axis=0)
+    if _share_upside_down(world_from_camera[:, :, 1]) >= _MANY_UPSIDE_DOWN:
+        level = world_from_camera[:, :, 2].mean(axis=0)  # nobody takes a wall so: all look down
     length = float(np.linalg.norm(level))
     if length < _MIN_SIGN:
         return np.array([0.0, 0.0, 1.0]), "camera_up"
     return level / length, "camera_up"
+
+
+def _share_upside_down(y_axes: Array) -> float:
+    """How many of parallel Y axes [N, 3] point against the others, at most a half."""
+    _, _, rows = np.linalg.svd(y_axes, full_matrices=False)
+    share = float((y_axes @ rows[0] < 0.0).mean())
+    return min(share, 1.0 - share)
 
 
 def _agreed(world_from_camera: Array, measured: Array) -> Array | None:

@@ -139,10 +139,17 @@ def test_a_field_is_no_wall_where_the_drone_says_so() -> None:
     np.testing.assert_allclose(back[:, 2, 3], back[0, 2, 3], atol=1e-9)
 
 
-def test_rows_that_are_flown_to_and_fro_are_over_a_field() -> None:
-    cameras = moved(over_a_field(turned=(3, 4, 5, 9, 10, 11)), 8)
+@pytest.mark.parametrize("back", [(3, 4, 5, 9, 10, 11), (4, 5, 6, 7), (0, 1, 2)])
+def test_rows_that_are_flown_to_and_fro_are_over_a_field(back: tuple[int, ...]) -> None:
+    cameras = moved(over_a_field(turned=back), 8)
     up, _ = find_up(cameras)
     assert angle_deg(up, random_rotation(8) @ [0, 0, 1]) < 1e-3
+
+
+def test_one_picture_of_a_wall_upside_down_makes_it_no_field() -> None:
+    up, found_by = find_up(moved(over_a_field(turned=(5,)), 8))
+    assert found_by == "camera_up"
+    assert angle_deg(up, random_rotation(8) @ [0, 1, 0]) < 1e-3
 
 
 @pytest.mark.parametrize(
