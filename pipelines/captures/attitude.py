@@ -31,8 +31,14 @@ _MOST_ROLL_DEG = 30.0
 """A gimbal that is rolled further holds the camera on its side, and what is up is not known."""
 _MOST_UPSIDE_DOWN = 0.3
 """Cameras turn pictures upright: one that is this far upside down was turned by a program since."""
-_TURNED = {1: (1, 0, 0, 1), 3: (-1, 0, 0, -1), 6: (0, 1, -1, 0), 8: (0, -1, 1, 0)}
-"""For EXIF's orientation, the rows of what turns stored pixels' (x, y) to those of the picture."""
+VIEWED = {
+    3: ((-1.0, 0.0), (0.0, -1.0)),
+    6: ((0.0, -1.0), (1.0, 0.0)),
+    8: ((0.0, 1.0), (-1.0, 0.0)),
+}
+"""By EXIF orientation (3, 6, 8): columns are the viewed picture's X and Y axis in those of the
+stored one, X right and Y up."""
+_AS_STORED = ((1.0, 0.0), (0.0, 1.0))
 
 
 def measured_up(
@@ -50,9 +56,10 @@ def measured_up(
         up = _felt(note)
     if up is None and isinstance(xmp, bytes):
         up = _of_gimbal(xmp)
-    if up is None or orientation not in _TURNED:
+    axes = _AS_STORED if orientation == 1 else VIEWED.get(orientation)
+    if up is None or axes is None:
         return None
-    xx, xy, yx, yy = _TURNED[orientation]
+    (xx, yx), (xy, yy) = axes
     turned = (xx * up[0] + xy * up[1], yx * up[0] + yy * up[1], up[2])
     length = math.hypot(*turned)
     if turned[1] < -_MOST_UPSIDE_DOWN * length:

@@ -89,15 +89,14 @@ def _up(
     image: PIL.Image.Image, note: object, orientation: int | None, lens: str | None
 ) -> Direction | None:
     """The direction away from gravity in the upright picture, to four digits, or None."""
-    told = getattr(image, "info", {})
     # libheif has turned its pictures already, and their EXIF calls them upright.
-    turned = told.get("original_orientation")
+    turned = image.info.get("original_orientation")
     width, height = image.size
     if turned is not None and turned >= _ON_ITS_SIDE:
         width, height = height, width
     up = measured_up(
         note,
-        told.get("xmp"),
+        image.info.get("xmp"),
         orientation=turned or orientation or 1,
         is_wide=width > height,
         lens=lens,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipelines.captures.attitude import Direction
+from pipelines.captures.attitude import VIEWED, Direction
 from pipelines.captures.contents import Up
 from pipelines.scene.orientation import find_up, rotation_to_z
 
@@ -31,13 +31,6 @@ _LEANS = {"measured": 0.94, "vertical": 0.94, "camera_up": 0.5}
 one is turned. A world that stands already, as one that we wrote, stays as it is."""
 _FAR = 100.0
 """How many times the cameras' extent the origin may be away."""
-_VIEWED = {
-    3: ((-1.0, 0.0), (0.0, -1.0)),
-    6: ((0.0, -1.0), (1.0, 0.0)),
-    8: ((0.0, 1.0), (-1.0, 0.0)),
-}
-"""By EXIF orientation (3, 6, 8): columns are the viewed picture's X and Y axis in those of the
-stored one, X right and Y up."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +76,7 @@ def settled(
         changed["up"] = axis
         told.append(f"In the pictures {axis} of the file's world is up, not +Z: it was turned.")
     elif up == "unknown":
-        told_up = [(np.nan,) * 3 if one is None else one for one in measured]
-        vertical, found_by = find_up(
-            as_viewed(world_from_camera, orientations), np.array(told_up) if told_up else None
-        )
+        vertical, found_by = find_up(as_viewed(world_from_camera, orientations), measured)
         changed["up_from"] = found_by
         if vertical[2] < _LEANS[found_by]:
             rotation = rotation_to_z(vertical)
@@ -113,8 +103,8 @@ def as_viewed(world_from_camera: Matrix, orientations: Sequence[int | None]) -> 
     """The poses of the pictures as people see them: turned by what EXIF says of each. [N, 3, 4]."""
     turned = world_from_camera.copy()
     for index, orientation in enumerate(orientations):
-        if orientation in _VIEWED:
-            axes = np.array(_VIEWED[orientation])
+        if orientation in VIEWED:
+            axes = np.array(VIEWED[orientation])
             turned[index, :, :2] = world_from_camera[index, :, :2] @ axes
     return turned
 

@@ -15,6 +15,7 @@ other, are those of a wall. There only what the devices measured tells, which is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,16 +79,18 @@ def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
     return flipped
 
 
-def find_up(world_from_camera: Array, measured: Array | None = None) -> tuple[Array, str]:
+def find_up(
+    world_from_camera: Array, measured: Sequence[Sequence[float] | None] = ()
+) -> tuple[Array, str]:
     """The direction away from gravity, [3] unit, and how it was found: measured, vertical or
     camera_up.
 
-    measured: [N, 3], that direction in each camera's axes, where its device told it; NaN elsewhere.
+    measured: N, that direction [3] in each camera's axes where its device told it; or none at all.
     Raises ValueError where there are no cameras.
     """
     if len(world_from_camera) == 0:
         raise ValueError("no cameras to find the vertical from")
-    if measured is not None and (told := _agreed(world_from_camera, measured)) is not None:
+    if (told := _agreed(world_from_camera, measured)) is not None:
         return told, "measured"
     x_axes = world_from_camera[:, :, 0]
     mean_up: Array = world_from_camera[:, :, 1].mean(axis=0)
@@ -111,13 +114,18 @@ def _share_upside_down(y_axes: Array) -> float:
     return min(share, 1.0 - share)
 
 
-def _agreed(world_from_camera: Array, measured: Array) -> Array | None:
+def _agreed(world_from_camera: Array, measured: Sequence[Sequence[float] | None]) -> Array | None:
     """The direction, [3] unit, that most of the measured ones are in the world; None where too few
     are known or they differ, as those of another camera's axes do once cameras turn."""
-    known = np.isfinite(measured).all(axis=1)
-    if known.sum() < max(_FEWEST_MEASURED, _LEAST_MEASURED * len(measured)):
+    told = np.array(
+        [
+            pose[:, :3] @ up
+            for pose, up in zip(world_from_camera, measured, strict=bool(measured))
+            if up is not None
+        ]
+    )
+    if len(told) < max(_FEWEST_MEASURED, _LEAST_MEASURED * len(world_from_camera)):
         return None
-    told = np.einsum("nij,nj->ni", world_from_camera[known][:, :, :3], measured[known])
     near = np.cos(np.radians(_SAME_UP_DEG))
     same = told @ told.T >= near
     same = same[same.sum(axis=1).argmax()]
@@ -165,7 +173,10 @@ def rotation_to_z(up: Array) -> Array:
 
 
 def normalise(
-    world_from_camera: Array, *, orient: bool = True, measured: Array | None = None
+    world_from_camera: Array,
+    *,
+    orient: bool = True,
+    measured: Sequence[Sequence[float] | None] = (),
 ) -> Normalisation:
     """The similarity that puts a reconstruction of unknown frame and scale into ours.
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.panoramas import MODEL, view_lens, world_from_views
-from pipelines.sfm.source import UNKNOWN_UP, Source
+from pipelines.sfm.source import Source
 from pipelines.tools.colmap_results import SparseModel
 
 
@@ -23,8 +23,8 @@ class FoundImages:
     """N images in capture order.
 
     files, timestamps_s: as in `Source`. cameras: their lenses. camera_of: [N], index into
-    `cameras`. world_from_camera: [N, 3, 4] float64. up: [N, 3], the direction away from gravity in
-    OpenGL camera axes (+X right, +Y up, looks along -Z), as measured by the device; else NaN.
+    `cameras`. world_from_camera: [N, 3, 4] float64. up: N, the direction away from gravity in
+    OpenGL camera axes (+X right, +Y up, looks along -Z) where the device measured it, else None.
     """
 
     files: tuple[str, ...]
@@ -32,7 +32,7 @@ class FoundImages:
     cameras: tuple[Intrinsics, ...]
     camera_of: tuple[int, ...]
     world_from_camera: npt.NDArray[np.float64]
-    up: npt.NDArray[np.float64]
+    up: tuple[Sequence[float] | None, ...]
 
 
 def found_images(model: SparseModel, source: Source) -> FoundImages:
@@ -42,7 +42,7 @@ def found_images(model: SparseModel, source: Source) -> FoundImages:
     times: list[float | None] = []
     camera_of: list[int] = []
     poses: list[npt.NDArray[np.float64]] = []
-    up: list[Sequence[float]] = []
+    up: list[Sequence[float] | None] = []
     for index, camera, pose in zip(
         model.indices, model.camera_of, model.world_from_camera, strict=True
     ):
@@ -52,7 +52,7 @@ def found_images(model: SparseModel, source: Source) -> FoundImages:
         num = len(poses) - len(times)
         times += [source.timestamps_s[index]] * num
         camera_of += [camera] * num
-        up += [UNKNOWN_UP if views else source.up_of(index)] * num
+        up += [None if views else source.up_of(index)] * num
     return FoundImages(
-        tuple(files), tuple(times), lenses, tuple(camera_of), np.stack(poses), np.array(up)
+        tuple(files), tuple(times), lenses, tuple(camera_of), np.stack(poses), tuple(up)
     )

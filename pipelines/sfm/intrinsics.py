@@ -189,23 +189,20 @@ def settle_lenses(
         )
         for step in (-_STEP, _STEP)
     ]
-    written = dict(zip(sorted(trials.cameras), model.cameras, strict=True))
-    found = [
-        _verdict_of(camera, written[camera], fits, best, moved, trials, wanted)
-        for camera in sorted(trials.cameras, key=lambda i: -trials.num_views[i])
-    ]
-    order = sorted(trials.cameras, key=lambda i: -trials.num_views[i])
     ids = sorted(trials.cameras)
+    written = dict(zip(ids, model.cameras, strict=True))
+    found = {
+        camera: _verdict_of(camera, written[camera], fits, best, moved, trials, wanted)
+        for camera in sorted(ids, key=lambda i: -trials.num_views[i])
+    }
     priors = {ids[place]: focal for place, focal in (priors_px or {}).items()}
-    weak = [camera for camera, verdict in zip(order, found, strict=True) if verdict.is_weak]
-    held = _held_by_exif(best, trials, {i: priors[i] for i in weak if i in priors})
+    weak = {i: priors[i] for i, verdict in found.items() if verdict.is_weak and i in priors}
+    held = _held_by_exif(best, trials, weak)
     if held:
         model = replace(trials.adopt(lenses, {**best.focal_px, **held}), agreement=model.agreement)
-        found = [
-            replace(verdict, focal_px=held[camera], is_exif=True) if camera in held else verdict
-            for camera, verdict in zip(order, found, strict=True)
-        ]
-    return model, tuple(found)
+        for camera, focal in held.items():
+            found[camera] = replace(found[camera], focal_px=focal, is_exif=True)
+    return model, tuple(found.values())
 
 
 def _held_by_exif(best: Fit, trials: LensTrials, priors: Mapping[int, float]) -> dict[int, float]:

@@ -23,7 +23,6 @@ from pipelines.workspace import Workspace
 _LENS_KEYS = ("make", "model", "lens", "focal_mm", "focal_35mm")
 """What of `pipelines.captures.exif.Exif` tells lenses apart."""
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
-UNKNOWN_UP = (math.nan, math.nan, math.nan)
 _FOCAL_RANGE = (0.2, 50.0)
 """Focal lengths that are believed, in long sides of the picture: a fisheye's to a telescope's."""
 _WIDE = 1.6
@@ -63,9 +62,9 @@ class Source:
         """The views cut from an image, which is a panorama then; none of any other."""
         return self.views[index] if self.views else ()
 
-    def up_of(self, index: int) -> tuple[float, ...]:
-        """Which way was up in an image, as measured (`pipelines.captures.attitude`), or NaN."""
-        return tuple((self.exif[index] if self.exif else {}).get("up", UNKNOWN_UP))
+    def up_of(self, index: int) -> Sequence[float] | None:
+        """Which way was up in an image, as measured (`pipelines.captures.attitude`), or None."""
+        return self.exif[index].get("up") if self.exif else None
 
     def clip_name(self, index: int) -> str:
         """What the sender called the clip that an image is of; "" where it has no name."""
