@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pipelines.nerf.space.cameras import Cameras
 
@@ -18,14 +19,25 @@ def between_pixels(picture: NDArray[np.float32], u: Floats, v: Floats) -> NDArra
 
     The centre of the top-left pixel is at 0.5, 0.5; beyond the outermost centres their value holds.
     """
-    height, width = picture.shape[:2]
-    u, v = np.clip(u - 0.5, 0.0, width - 1.0), np.clip(v - 0.5, 0.0, height - 1.0)
-    i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
-    fu, fv = (u - i)[:, None], (v - j)[:, None]
-    top = picture[j, i] * (1.0 - fu) + picture[j, i + 1] * fu
-    bottom = picture[j + 1, i] * (1.0 - fu) + picture[j + 1, i + 1] * fu
-    found: NDArray[np.float32] = (top * (1.0 - fv) + bottom * fv).astype(np.float32)
+    places = sampling_grid(u, v, picture.shape[1], picture.shape[0])
+    found: NDArray[np.float32] = at_grid(picture, places[None])[0]
     return found
+
+
+def sampling_grid(u: Floats, v: Floats, width: int, height: int) -> Tensor:
+    """Places [..., 2] for `at_grid`, of columns u and rows v of pictures of a size, [...] each."""
+    places = np.stack([2.0 * u / width - 1.0, 2.0 * v / height - 1.0], axis=-1)
+    return torch.from_numpy(places.astype(np.float32))
+
+
+def at_grid(picture: NDArray[np.float32], places: Tensor) -> NDArray[np.float32]:
+    """`between_pixels` of a picture [H, W, C] at places [R, N, 2]: [R, N, C]."""
+    channels = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    found = torch.nn.functional.grid_sample(
+        channels, places[None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    values: NDArray[np.float32] = found[0].permute(1, 2, 0).numpy()
+    return values
 
 
 def points_in_frame(

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from pipelines.nerf.data.light import levelled
 from pipelines.nerf.space.lenses import CAMERA_MODELS, distort
@@ -17,6 +18,7 @@ from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.depth_sampling import sampled
 from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.picture_sampling import at_grid, sampling_grid
 from pipelines.scene.sensor_depth import load_sensor_depth
 
 _OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
@@ -92,11 +94,12 @@ def undistorted_picture(
     with Image.open(root / image.file) as opened:
         opened.draft("RGB", size)
         stored = np.asarray(opened.convert("RGB").resize(size, Image.Resampling.BOX))
-    picture = levelled(stored, image.light).astype(np.float32)
-    channels = [_undistorted(picture[..., channel], lens, pinhole) for channel in range(3)]
-    shown: NDArray[np.uint8] = np.rint(np.clip(np.stack(channels, axis=-1), 0, 255)).astype(
-        np.uint8
-    )
+    picture = levelled(stored, image.light)
+    if not _is_distorted(lens):
+        return picture
+    grid, inside = _warp(lens, pinhole)
+    shown: NDArray[np.uint8] = np.rint(at_grid(picture.astype(np.float32), grid)).astype(np.uint8)
+    shown[~inside] = 0
     return shown
 
 
@@ -130,19 +133,23 @@ def _undistorted(
     """The picture [H, W] as the pinhole would show it; negative where it has nothing."""
     if not _is_distorted(lens):
         return picture
-    height, width = picture.shape
+    grid, usable = _warp(lens, pinhole)
+    there = picture >= 0.0
+    values = at_grid(picture[..., None], grid)[..., 0]
+    if not there.all():
+        usable = usable & (at_grid((~there[..., None]).astype(np.float32), grid)[..., 0] == 0.0)
+    return np.where(usable, values, np.float32(-1.0))
+
+
+@lru_cache(maxsize=2)
+def _warp(lens: Intrinsics, pinhole: Pinhole) -> tuple[Tensor, NDArray[np.bool_]]:
+    """Where in a stored picture of the pinhole's size each of its pixels is, for `at_grid`, and
+    whether it is in the picture, [H, W]."""
+    width, height = pinhole.width, pinhole.height
     u, v = _image_pixels(lens, pinhole)
-    u, v = u * (width / lens.width) - 0.5, v * (height / lens.height) - 0.5
-    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    i = np.clip(u.astype(int), 0, width - 2)
-    j = np.clip(v.astype(int), 0, height - 2)
-    fu, fv = np.clip(u - i, 0.0, 1.0), np.clip(v - j, 0.0, 1.0)
-    corners = (picture[j, i], picture[j, i + 1], picture[j + 1, i], picture[j + 1, i + 1])
-    top = corners[0] + fu * (corners[1] - corners[0])
-    bottom = corners[2] + fu * (corners[3] - corners[2])
-    usable = inside & (np.minimum.reduce(corners) >= 0.0)
-    values = np.where(usable, top + fv * (bottom - top), -1.0)
-    return values.astype(np.float32)
+    u, v = u * (width / lens.width), v * (height / lens.height)
+    inside = (u >= 0.5) & (v >= 0.5) & (u <= width - 0.5) & (v <= height - 0.5)
+    return sampling_grid(u, v, width, height), inside
 
 
 def _lengths(lens: Pinhole) -> tuple[float, float, float, float]:

@@ -39,6 +39,7 @@ from pipelines.exports.surface.flatness import NOWHERE, find_flat_parts
 from pipelines.exports.surface.outline_views import Answers, OutlineView
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
+from pipelines.scene.ahead import ahead
 from pipelines.scene.stereo_views import ColorView
 
 Floats = NDArray[np.float64]
@@ -97,10 +98,14 @@ def outlined(
     on_plane = flat_parts.plane_of != NOWHERE
     for index, step in enumerate(_ROUNDS):
         sight = Sight(vertices, mesh.faces)
-        parts = []
-        for number, view in enumerate(views):
+
+        def asked(view: ColorView, sight: Sight = sight, step: _Round = step) -> Answers:
             seen = OutlineView(sight, corner_colors, view.reduced(step.factor), origin)
-            parts.append(seen.answers(step.begins))
+            return seen.answers(step.begins)
+
+        parts = []
+        for number, part in enumerate(ahead(asked, views)):
+            parts.append(part)
             done = (1.0 - _SOLVE_SHARE) * (number + 1) / len(views)
             on_progress((index + done) / len(_ROUNDS))
         answers = Answers.joined(parts).thinned(_MOST_ANSWERS)

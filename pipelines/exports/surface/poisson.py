@@ -11,6 +11,7 @@ Source: Kazhdan and Hoppe, "Screened Poisson Surface Reconstruction", 2013, as O
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from pipelines.exports.surface.cloud import Cloud, with_normals
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.exports.surface.tsdf import Sized
 from pipelines.exports.surface.view_colors import seen_colors
+from pipelines.scene.ahead import ahead
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.consistency import consistent
 from pipelines.scene.depth_views import DepthView
@@ -148,20 +150,10 @@ def averaged(
     while True:
         sums = _Sums(np.zeros(0, np.int64), np.zeros((0, 9)), np.zeros(0, np.int64))
         counts = np.ceil((bounds.box_max - bounds.box_min) / side).astype(np.int64) + 1
-        for done, view in enumerate(views):
+        shown = ahead(functools.partial(_means, bounds, side, counts), views)
+        for done, (key, mean) in enumerate(shown):
             on_progress(1.0 - left * (1.0 - 0.5 * done / len(views)))
-            mask = bounds.mask(view)
-            points = view.points()[mask]
-            cubes = np.floor((points - bounds.box_min) / side).astype(np.int64)
-            cubes = np.clip(cubes, 0, counts - 1)
-            flat = (cubes[:, 0] * counts[1] + cubes[:, 1]) * counts[2] + cubes[:, 2]
-            eyes = np.broadcast_to(view.world_from_camera[:, 3], points.shape)
-            told = np.concatenate([points - bounds.box_min, view.rgb[mask], eyes], axis=1)
-            key, at, pixels = np.unique(flat, return_inverse=True, return_counts=True)
-            total = np.stack(
-                [np.bincount(at, told[:, column], len(key)) for column in range(9)], axis=1
-            )
-            sums = sums.with_one_more(key, total / pixels[:, None])
+            sums = sums.with_one_more(key, mean)
         agreed = sums.num_views >= _MIN_VIEWS
         if int(agreed.sum()) <= MOST_POINTS:
             break
@@ -170,6 +162,23 @@ def averaged(
     found: Floats = sums.total[agreed] / sums.num_views[agreed][:, None]
     colors = np.rint(found[:, 3:6]).astype(np.uint8)
     return Cloud.seen(found[:, :3] + bounds.box_min, colors, found[:, 6:]), side
+
+
+def _means(
+    bounds: SceneBounds, side: float, counts: NDArray[np.int64], view: DepthView
+) -> tuple[NDArray[np.int64], Floats]:
+    """The cubes that a view shows, and the mean of its pixels there. counts: [3], cubes along each
+    axis."""
+    mask = bounds.mask(view)
+    points = view.points()[mask]
+    cubes = np.floor((points - bounds.box_min) / side).astype(np.int64)
+    cubes = np.clip(cubes, 0, counts - 1)
+    flat = (cubes[:, 0] * counts[1] + cubes[:, 1]) * counts[2] + cubes[:, 2]
+    eyes = np.broadcast_to(view.world_from_camera[:, 3], points.shape)
+    told = np.concatenate([points - bounds.box_min, view.rgb[mask], eyes], axis=1)
+    key, at, pixels = np.unique(flat, return_inverse=True, return_counts=True)
+    total = np.stack([np.bincount(at, told[:, column], len(key)) for column in range(9)], axis=1)
+    return key, total / pixels[:, None]
 
 
 def _near(mesh: TriangleMesh, points: Floats, reach: float) -> TriangleMesh:

@@ -36,6 +36,7 @@ from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
 from pipelines.nerf.stereo.refinement import Offsets, Pictures, photo_offsets
 from pipelines.nerf.stereo.views import StereoView
+from pipelines.scene.ahead import ahead
 
 Floats = NDArray[np.float64]
 
@@ -154,13 +155,18 @@ def _seen(
     sight = Sight(vertices, faces)
     edges = vertices[faces[:, 0]] - vertices[faces[:, 1]]
     lifted = vertices + 0.5 * float(np.median(np.linalg.norm(edges, axis=1))) * normals
-    seen = np.zeros((len(views), len(vertices)), np.uint8)
-    for index, view in enumerate(views):
-        _, shown = view.seen(vertices + origin)
+    placed = vertices + origin
+
+    def seen_by(view: StereoView) -> NDArray[np.bool_]:
+        _, shown = view.seen(placed)
         eye = view.center - origin
-        shown &= ((eye - vertices) * normals).sum(axis=1) > 0.0
-        which = np.flatnonzero(shown)
-        seen[index, which] = sight.reached(eye, lifted[which])
+        shown &= np.einsum("vd,vd->v", eye - vertices, normals) > 0.0
+        shown[shown] = sight.reached(eye, lifted[shown])
+        return shown
+
+    seen = np.zeros((len(views), len(vertices)), np.uint8)
+    for index, shown in enumerate(ahead(seen_by, views)):
+        seen[index] = shown
         on_view((index + 1) / len(views))
     return seen
 

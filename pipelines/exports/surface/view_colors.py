@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.exports.mesh import Floats, TriangleMesh
 from pipelines.exports.surface.tsdf import Sized
+from pipelines.scene.ahead import ahead
 from pipelines.scene.depth_views import DepthView
 from pipelines.scene.picture_sampling import between_pixels
 
@@ -30,8 +31,8 @@ def seen_colors(
     """
     count = np.zeros(len(mesh.vertices), np.int32)
     weight, total = np.zeros((len(mesh.vertices), 1)), np.zeros((len(mesh.vertices), 3))
-    for done, view in enumerate(views, start=1):
-        which, cosine, colors = _shown(mesh, view, beside)
+    shown = ahead(lambda view: _shown(mesh, view, beside), views)
+    for done, (which, cosine, colors) in enumerate(shown, start=1):
         count[which] += 1
         weight[which] += cosine[:, None]
         total[which] += cosine[:, None] * colors
@@ -49,8 +50,8 @@ def _shown(
     toward = mesh.vertices - eye
     x, y, back = (toward @ view.world_from_camera[:, :3]).T
     depth = np.maximum(-back, 1e-12)
-    length = np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
-    cosine = -(toward * mesh.normals).sum(axis=1) / length
+    length = np.maximum(np.sqrt(np.einsum("vd,vd->v", toward, toward)), 1e-12)
+    cosine = -np.einsum("vd,vd->v", toward, mesh.normals) / length
     column, row = lens.cx + lens.fl_x * x / depth, lens.cy - lens.fl_y * y / depth
     inside = (cosine > _LEAST_COSINE) & (back < -1e-9) & (column >= 0) & (column < lens.width)
     which = np.flatnonzero(inside & (row >= 0) & (row < lens.height))

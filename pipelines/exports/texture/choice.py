@@ -8,6 +8,7 @@ not count. Here candidates are few per face and the choice is found by repeated 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from pipelines.exports.surface.sight import Sight
 from pipelines.exports.texture.photos import Photos, colors_at, sharpness, softened
+from pipelines.scene.ahead import ahead
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.int32]
@@ -77,10 +79,10 @@ class Surface:
 
     def unhindered(self, eye: Floats, faces: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which of some faces an eye sees whole: their middle and their three corners."""
-        used = np.unique(self.faces[faces])
         seen = np.zeros(len(self.vertices), np.bool_)
-        seen[used] = self._sight.reached(eye, self._lifted_vertices[used])
-        whole: NDArray[np.bool_] = np.all(seen[self.faces[faces]], axis=1)
+        seen[self.faces[faces]] = True
+        seen[seen] = self._sight.reached(eye, self._lifted_vertices[seen])
+        whole = _all_of(seen, self.faces[faces])
         whole[whole] = self._sight.reached(eye, self._lifted_centers[faces[whole]])
         return whole
 
@@ -91,29 +93,37 @@ class Surface:
         return self._sight.met(eye, ways)
 
 
+def _all_of(flags: NDArray[np.bool_], faces: Ints) -> NDArray[np.bool_]:
+    """Which faces [F, 3] have all three of their vertices flagged; flags: [V]."""
+    one, two, three = faces.T
+    flagged: NDArray[np.bool_] = flags[one] & flags[two] & flags[three]
+    return flagged
+
+
 def choose_photos(
     surface: Surface, photos: Photos, on_progress: Callable[[float], None] = lambda done: None
 ) -> Ints:
     """The photo of each face, [F]; `NOBODY` where none shows it whole. on_progress: may raise."""
     candidates = _Candidates.none(len(surface.faces))
-    for index in range(len(photos)):
-        _look(surface, photos, index, candidates)
+    looks = ahead(functools.partial(_look, surface, photos), range(len(photos)))
+    for index, (faces, score, color) in enumerate(looks):
+        candidates.offer(faces, index, score, color)
         on_progress((index + 1) / len(photos))
     _drop_unlike(candidates)
     return _settled(candidates, neighbours_of(surface.faces))
 
 
-def _look(surface: Surface, photos: Photos, index: int, candidates: _Candidates) -> None:
-    """Offer a photo to all faces that it shows."""
+def _look(
+    surface: Surface, photos: Photos, index: int
+) -> tuple[NDArray[np.intp], Floats, NDArray[np.float32]]:
+    """The faces that a photo shows [N], how well [N], and in what colour [N, 3]."""
     eye = photos.eye(index)
     toward = eye - surface.centers
-    distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-30)
-    facing = (toward * surface.face_normals).sum(axis=1) > _LEAST_COSINE * distance
+    distance = np.maximum(np.sqrt(np.einsum("fd,fd->f", toward, toward)), 1e-30)
+    facing = np.einsum("fd,fd->f", toward, surface.face_normals) > _LEAST_COSINE * distance
     pixels, inside = photos.pixels(index, surface.vertices)
-    faces = np.flatnonzero(facing & inside[surface.faces].all(axis=1))
+    faces = np.flatnonzero(facing & _all_of(inside, surface.faces))
     faces = faces[surface.unhindered(eye, faces)]
-    if len(faces) == 0:
-        return
     corners = pixels[surface.faces[faces]]
     middle = corners.mean(axis=1)
     kept = photos.usable(index, middle)
@@ -122,7 +132,7 @@ def _look(surface: Surface, photos: Photos, index: int, candidates: _Candidates)
     area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     glance, share = photos.glance(index)
     score = area * sharpness(glance)
-    candidates.offer(faces, index, score, colors_at(softened(glance), middle * share))
+    return faces, score, colors_at(softened(glance), middle * share)
 
 
 def _drop_unlike(candidates: _Candidates) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
@@ -70,10 +69,11 @@ class Photos:
         with Image.open(self._root / self._images[index].file) as opened:
             return self._levelled(index, opened.convert("RGB"))
 
-    def rays(self, index: int, pixels: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where the camera is [3], and unit directions [P, 3] through pixels [P, 2]."""
-        which = torch.full((len(pixels),), index)
-        rays = self._cameras.generate_rays(which, torch.as_tensor(pixels, dtype=torch.float32))
+    def rays(
+        self, index: int, side: int = _GLANCE_SIDE
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where the camera is [3], and unit directions [H * W, 3] of all pixels of its `glance`."""
+        rays = self._cameras.select([index]).resized(side).image_rays(0)
         return self.eye(index).astype(np.float32), rays.directions.numpy()
 
     def pixel_angle(self, index: int) -> float:

@@ -36,6 +36,7 @@ from pipelines.exports.texture.charts import MARGIN_PX, Charts, Layout
 from pipelines.exports.texture.choice import NOBODY, Surface
 from pipelines.exports.texture.photos import Photos
 from pipelines.exports.texture.texels import moving, spread
+from pipelines.scene.ahead import ahead
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -181,7 +182,7 @@ def _missed(seen: csr_array, color: Bytes, texels: Floats) -> Floats:
     """By how much pixels [N, 3] are missed, summed over those that see each texel, and how much
     they count in all, [M, 4]."""
     off = color.astype(np.float32) / np.float32(255.0) - seen @ texels
-    size = np.sqrt(np.square(off).mean(axis=1))
+    size = np.sqrt(np.einsum("nc,nc->n", off, off) / np.float32(3.0))
     weight = np.float32(_FAR_OFF) / np.maximum(size, np.float32(_FAR_OFF))
     sums: Floats = seen.T @ np.column_stack([weight[:, None] * off, weight])
     return sums
@@ -235,10 +236,11 @@ def _looks(
     stride = max(1, -(-sum(width * height for width, height in sizes) // _PIXELS))
     texels = _Waiting(lambda places, level: mixing(places, level, layout.side // 2))
     vertices = _Waiting(lambda which, weights: _of_corners(which, weights, len(surface.vertices)))
-    for index in range(len(photos)):
+
+    def look(index: int) -> tuple[tuple[Any, Any, Bytes], tuple[Any, Any, Bytes]]:
         glance, share = photos.glance(index, _SIDE)
         width, height = glance.size
-        kept, distance, face, weights = _met(surface, photos, index, (width, height), share)
+        kept, distance, face, weights = _met(surface, photos, index, (width, height))
         chosen = np.zeros(len(kept), np.bool_)
         chosen[index % stride :: stride] = True
         kept &= chosen
@@ -248,14 +250,18 @@ def _looks(
             kept[kept] = photos.usable(index, pixels)
         colors = np.asarray(glance).reshape(-1, 3)
         alone = kept & ~painted[face]
-        vertices.add(surface.faces[face[alone]], weights[alone], colors[alone])
+        bare = surface.faces[face[alone]], weights[alone], colors[alone]
         kept &= painted[face]
         face, distance = face[kept], distance[kept]
         places = np.einsum("nc,ncd->nd", weights[kept], layout.uv[charts.faces[face]])
         angle = photos.pixel_angle(index) / share.mean()
         wanted = np.maximum(density[face] * distance * angle, 1.0)
         level = np.clip(np.rint(np.log2(wanted)).astype(np.int64), 1, _COPIES) - 1
-        texels.add(0.5 * places, level, colors[kept])
+        return (0.5 * places, level, colors[kept]), bare
+
+    for index, (shown, bare) in enumerate(ahead(look, range(len(photos)))):
+        texels.add(*shown)
+        vertices.add(*bare)
         on_progress((index + 1) / len(photos))
     return texels.all(), vertices.all()
 
@@ -295,17 +301,13 @@ def _of_corners(vertices: NDArray[np.int32], weights: Floats, num_vertices: int)
 
 
 def _met(
-    surface: Surface, photos: Photos, index: int, size: tuple[int, int], share: NDArray[np.float64]
+    surface: Surface, photos: Photos, index: int, size: tuple[int, int]
 ) -> tuple[NDArray[np.bool_], Floats, NDArray[np.int64], Floats]:
-    """Of all pixels of a photo of some size: whether it counts [N], distance [N], face [N], where
+    """Of all pixels of a glance of some size: whether it counts [N], distance [N], face [N], where
     in the face [N, 3].
-
-    share: [2], of the whole photo's size.
     """
     width, height = size
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([x.reshape(-1), y.reshape(-1)], axis=1) / share
-    eye, ways = photos.rays(index, pixels)
+    eye, ways = photos.rays(index, _SIDE)
     distance, face, weights = surface.met(eye, ways)
     facing = -np.einsum("nd,nd->n", ways, surface.face_normals[face].astype(np.float32))
     kept = np.isfinite(distance) & (facing > _LEAST_COSINE)
@@ -351,8 +353,10 @@ def _gathered(sums: Floats, side: int) -> Floats:
 
 def _halved(picture: Floats) -> Floats:
     """[H, W, 3] with 2 x 2 texels as one."""
-    height, width = picture.shape[0] // 2, picture.shape[1] // 2
-    mean: Floats = picture.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    mean: Floats = picture[::2, ::2] + picture[1::2, ::2]
+    mean += picture[::2, 1::2]
+    mean += picture[1::2, 1::2]
+    mean *= np.float32(0.25)
     return mean
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -41,6 +41,8 @@ MAX_PANORAMA = 1.01
 """Share of the sphere that an equirectangular picture may cover: all of it, and rounding."""
 LENS_GRID = 13
 """Points along each side of a picture at which its lens is tried out, corners included."""
+REMEMBERED_PX = 4_000_000
+"""Pictures of at most so many have the rays of their lens remembered, at 12 bytes each."""
 
 
 def reduced_size(width: int, height: int, long_side: int) -> tuple[int, int]:
@@ -214,29 +216,23 @@ class Cameras:
         with_pixel_area: also give each pixel's solid angle (three times the work).
         """
         directions = self._directions(camera_indices, pixels)
-        area = None
-        if with_pixel_area:
-            steps = torch.eye(2, dtype=pixels.dtype, device=pixels.device)
-            right = self._directions(camera_indices, pixels + steps[0]) - directions
-            down = self._directions(camera_indices, pixels + steps[1]) - directions
-            area = torch.linalg.cross(right, down).norm(dim=-1)
-        return Rays(
-            origins=self.scene_from_camera[camera_indices, :, 3],
-            directions=directions,
-            camera_indices=camera_indices,
-            pixel_area=area,
-            times=None if self.times is None else self.times[camera_indices],
-        )
+        area = self._pixel_area(camera_indices, pixels, directions) if with_pixel_area else None
+        return self._rays(camera_indices, directions, area)
 
     def image_rays(self, index: int, *, with_pixel_area: bool = False) -> Rays:
-        """The rays through all pixel centres of one camera, row by row: R = height * width."""
-        width, height = self.size[index].tolist()
-        device = self.size.device
-        x = torch.arange(width, device=device, dtype=self.focal.dtype) + 0.5
-        y = torch.arange(height, device=device, dtype=self.focal.dtype) + 0.5
-        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
-        indices = torch.full((len(pixels),), index, dtype=torch.int64, device=device)
-        return self.generate_rays(indices, pixels, with_pixel_area=with_pixel_area)
+        """The rays through all pixel centres of one camera, row by row: R = height * width.
+
+        Quicker than `generate_rays` of the same pixels, and the more so for a picture of the same
+        lens as the one before. with_pixel_area: as there.
+        """
+        width, height = (int(side) for side in self.size[index].tolist())
+        area = None
+        indices = torch.full((width * height,), index, device=self.size.device)
+        directions = self._picture_directions(index)
+        if with_pixel_area:
+            pixels = _pixel_centres(width, height).to(directions)
+            area = self._pixel_area(indices, pixels, self._directions(indices, pixels))
+        return self._rays(indices, directions, area)
 
     def project(self, points: Tensor, camera_indices: Tensor) -> tuple[Tensor, Tensor]:
         """Where points appear.
@@ -273,6 +269,40 @@ class Cameras:
         which = which[error < MAX_ANGLE_ERROR]
         return which, pixels[which], z_depth[which]
 
+    def _rays(self, camera_indices: Tensor, directions: Tensor, area: Tensor | None) -> Rays:
+        return Rays(
+            origins=self.scene_from_camera[camera_indices, :, 3],
+            directions=directions,
+            camera_indices=camera_indices,
+            pixel_area=area,
+            times=None if self.times is None else self.times[camera_indices],
+        )
+
+    def _pixel_area(self, camera_indices: Tensor, pixels: Tensor, directions: Tensor) -> Tensor:
+        """Solid angles [R] of pixels with those directions."""
+        steps = torch.eye(2, dtype=pixels.dtype, device=pixels.device)
+        right = self._directions(camera_indices, pixels + steps[0]) - directions
+        down = self._directions(camera_indices, pixels + steps[1]) - directions
+        area: Tensor = torch.linalg.cross(right, down).norm(dim=-1)
+        return area
+
+    def _picture_directions(self, index: int) -> Tensor:
+        """Unit directions [H * W, 3] in scene space through all pixel centres of one camera."""
+        model, terms = int(self.model[index]), tuple(self.distortion[index].tolist())
+        plain = model == OPENCV and not any(terms)
+        lens = _Lens(
+            PINHOLE if plain else model,
+            terms,
+            tuple(self.focal[index].tolist()),
+            tuple(self.principal[index].tolist()),
+            tuple(self.size[index].tolist()),
+            self.inverse_steps,
+        )
+        few = lens.size[0] * lens.size[1] <= REMEMBERED_PX
+        local = (_ways_of_lens if few else _ways_of_lens.__wrapped__)(lens)
+        rotation = self.scene_from_camera[index, :, :3]
+        return torch.nn.functional.normalize(local.to(rotation) @ rotation.T, dim=-1)
+
     def _directions(self, camera_indices: Tensor, pixels: Tensor) -> Tensor:
         """Unit directions [R, 3] in scene space."""
         plane = (pixels - self.principal[camera_indices]) / self.focal[camera_indices]
@@ -284,6 +314,38 @@ class Cameras:
         local = _flipped(local)
         turned = (self.scene_from_camera[camera_indices, :, :3] @ local[..., None]).squeeze(-1)
         return torch.nn.functional.normalize(turned, dim=-1)
+
+
+class _Lens(NamedTuple):
+    """What tells where the pixels of a picture look, in its camera. As `Cameras` has them."""
+
+    formula: int
+    distortion: tuple[float, ...]
+    focal: tuple[float, ...]
+    principal: tuple[float, ...]
+    size: tuple[int, ...]
+    inverse_steps: int
+
+
+@lru_cache(maxsize=2)
+def _ways_of_lens(lens: _Lens) -> Tensor:
+    """Directions [H * W, 3], not normalised, of all pixel centres in OpenGL's camera axes.
+
+    Remembered, since the pictures of a capture are looked through one by one with the same lens.
+    Nobody may change it.
+    """
+    width, height = lens.size
+    focal, principal = (torch.tensor(values) for values in (lens.focal, lens.principal))
+    plane = (_pixel_centres(width, height) - principal) / focal
+    terms, model = torch.tensor([lens.distortion]), torch.tensor([lens.formula])
+    local = undistort(plane, terms, model, (lens.formula,), lens.inverse_steps)
+    return _flipped(local)
+
+
+def _pixel_centres(width: int, height: int) -> Tensor:
+    """[H * W, 2], row by row."""
+    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
 
 
 def _flipped(local: Tensor) -> Tensor:

@@ -201,6 +201,25 @@ def test_an_opencv_lens_without_terms_takes_the_pinhole_path() -> None:
     assert torch.equal(plain.image_rays(0).directions, pinhole.image_rays(0).directions)
 
 
+def test_a_pictures_rays_are_those_of_its_pixels_whatever_lens_came_before() -> None:
+    small = MIXED.resized(40)
+    for index in (0, 1, 2, 3, 1, 0, 3, 2):
+        width, height = small.size[index].tolist()
+        rows, columns = torch.meshgrid(
+            torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"
+        )
+        pixels = torch.stack([columns, rows], dim=-1).reshape(-1, 2)
+        rows_of = torch.full((len(pixels),), index)
+        one_by_one = small.generate_rays(rows_of, pixels, with_pixel_area=True)
+        picture = small.image_rays(index, with_pixel_area=True)
+        assert picture.pixel_area is not None
+        assert one_by_one.pixel_area is not None
+        assert torch.equal(picture.camera_indices, rows_of)
+        assert torch.equal(picture.origins, one_by_one.origins)
+        assert torch.allclose(picture.directions, one_by_one.directions, atol=1e-6)
+        assert torch.allclose(picture.pixel_area, one_by_one.pixel_area, rtol=1e-3)
+
+
 def test_the_time_of_a_picture_goes_to_its_rays() -> None:
     times = [0.0, 0.25, 1.0]
     cameras = _cameras(("PINHOLE",) * 3, ((0.0,) * 6,) * 3, times=times).resized(64)

@@ -1,0 +1,43 @@
+"""Work on many things of which one after another is wanted, some of them begun ahead."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from pipelines.nerf.engines.cpu.parts.runtime import num_threads
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+_MOST_THREADS = 4
+"""Each may have threads of its own, as of a ray caster."""
+
+
+def ahead(
+    work: Callable[[_Item], _Result], items: Iterable[_Item]
+) -> Generator[_Result, None, None]:
+    """`work` of each item, in their order, on as many threads as torch has, or a few.
+
+    What lets go of the interpreter's lock, as large arrays, files and rays do, is done side by
+    side. So much is held at a time: a result for each thread, and the one that is asked for. What
+    `work` raises is raised in its turn; whoever stops asking waits for what was begun.
+    """
+    threads = min(num_threads(), _MOST_THREADS)
+    if threads == 1:
+        yield from map(work, items)
+        return
+    begun: deque[Future[_Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                begun.append(pool.submit(work, item))
+                if len(begun) > threads:
+                    yield begun.popleft().result()
+            while begun:
+                yield begun.popleft().result()
+        finally:
+            for future in begun:
+                future.cancel()

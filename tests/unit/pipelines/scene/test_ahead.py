@@ -1,0 +1,79 @@
+"""Work begun ahead: same answers, in order, not too much of it at a time."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+import torch
+
+from pipelines.scene.ahead import ahead
+
+
+@pytest.fixture(params=[1, 3])
+def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    number = int(request.param)
+    monkeypatch.setattr("pipelines.scene.ahead.num_threads", lambda: number)
+    return number
+
+
+def test_results_come_in_the_order_of_their_items(threads: int) -> None:
+    def slower_first(item: int) -> int:
+        time.sleep(0.02 if item % 3 == 0 else 0.0)
+        return item * item
+
+    assert list(ahead(slower_first, range(20))) == [item * item for item in range(20)]
+    assert list(ahead(slower_first, [])) == []
+
+
+def test_no_more_is_begun_than_threads_and_one(threads: int) -> None:
+    begun: list[int] = []
+    for taken, _ in enumerate(ahead(begun.append, range(30)), start=1):
+        time.sleep(0.005)
+        assert len(begun) <= taken + threads
+
+
+@pytest.mark.usefixtures("threads")
+def test_what_is_raised_comes_in_its_turn_and_ends_the_rest() -> None:
+    begun: list[int] = []
+
+    def odd_one_out(item: int) -> int:
+        begun.append(item)
+        if item == 4:
+            raise ValueError("the fifth")
+        return item
+
+    seen: list[int] = []
+    with pytest.raises(ValueError, match="the fifth"):
+        seen.extend(ahead(odd_one_out, range(100)))
+    assert seen == [0, 1, 2, 3]
+    assert max(begun) < 10
+
+
+def test_whoever_stops_asking_leaves_no_thread_behind() -> None:
+    before = threading.active_count()
+    results = ahead(lambda item: item, range(100))
+    assert next(results) == 0
+    results.close()
+    assert threading.active_count() == before
+
+
+def test_torch_says_how_many() -> None:
+    torch_has = torch.get_num_threads()
+    names: set[str] = set()
+
+    def named(_: int) -> None:
+        names.add(threading.current_thread().name)
+        time.sleep(0.01)
+
+    try:
+        torch.set_num_threads(1)
+        list(ahead(named, range(8)))
+        assert names == {threading.current_thread().name}
+        torch.set_num_threads(2)
+        names.clear()
+        list(ahead(named, range(8)))
+        assert len(names) == 2
+    finally:
+        torch.set_num_threads(torch_has)
