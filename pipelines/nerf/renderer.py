@@ -130,13 +130,16 @@ class Renderer:
         progress: called with the share that is done, in (0, 1]; what it raises ends the rendering.
         """
         width, height = (int(side) for side in cameras.size[index].tolist())
+        source = cameras.select([index]).to(self._device)
         side = self._config.block_px if self.engine == "fast" else 1
         order = pixels_in_blocks(width, height, side).to(self._device)
 
-        rays = cameras.select([index]).to(self._device).image_rays(0)
-
         def rays_of(begin: int, end: int) -> Rays:
-            return rays.select(order[begin:end])
+            pixel = order[begin:end]
+            columns, rows = pixel % width, pixel // width
+            return source.generate_rays(
+                torch.zeros_like(pixel), torch.stack([columns, rows], dim=-1).float() + 0.5
+            )
 
         flat = self._render(rays_of, width * height, appearance, progress)
         place = np.empty(len(order), np.int64)

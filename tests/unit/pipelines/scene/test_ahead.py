@@ -6,9 +6,9 @@ import threading
 import time
 
 import pytest
-import torch
 
 from pipelines.scene.ahead import ahead
+from tests.threads import torch_threads
 
 
 @pytest.fixture(params=[1, 3])
@@ -53,27 +53,25 @@ def test_what_is_raised_comes_in_its_turn_and_ends_the_rest() -> None:
 
 def test_whoever_stops_asking_leaves_no_thread_behind() -> None:
     before = threading.active_count()
-    results = ahead(lambda item: item, range(100))
-    assert next(results) == 0
-    results.close()
+    with torch_threads(2):
+        results = ahead(lambda item: item, range(100))
+        assert next(results) == 0
+        assert threading.active_count() > before
+        results.close()
     assert threading.active_count() == before
 
 
 def test_torch_says_how_many() -> None:
-    torch_has = torch.get_num_threads()
     names: set[str] = set()
 
     def named(_: int) -> None:
         names.add(threading.current_thread().name)
         time.sleep(0.01)
 
-    try:
-        torch.set_num_threads(1)
+    with torch_threads(1):
         list(ahead(named, range(8)))
-        assert names == {threading.current_thread().name}
-        torch.set_num_threads(2)
-        names.clear()
+    assert names == {threading.current_thread().name}
+    names.clear()
+    with torch_threads(2):
         list(ahead(named, range(8)))
-        assert len(names) == 2
-    finally:
-        torch.set_num_threads(torch_has)
+    assert len(names) == 2

@@ -109,8 +109,13 @@ def test_maps_bring_light_to_where_the_surface_is() -> None:
     told = tiny_config(max_steps=160, depth=DepthLossConfig(weight=0.05, weight_final=0.05))
     without = depth_error(tiny_config(max_steps=160), None)
     assert depth_error(told, maps) < 0.7 * without
-    unused = tiny_config(max_steps=160, depth=DepthLossConfig(weight=0.0))
-    assert depth_error(unused, maps) == without
+
+
+def test_maps_without_weight_change_nothing() -> None:
+    unused = tiny_config(max_steps=16, depth=DepthLossConfig(weight=0.0))
+    told = replace(unused, depth=DepthLossConfig(weight=0.05))
+    maps = exact_maps(toy_cameras(12))
+    assert depth_error(unused, maps) == depth_error(unused, None) != depth_error(told, maps)
 
 
 def test_maps_must_be_those_of_the_training_images() -> None:

@@ -27,6 +27,7 @@ from pipelines.nerf.training.checkpoint import load_checkpoint
 from pipelines.nerf.training.gpu_steps import GpuSteps
 from pipelines.nerf.training.loop import TrainProgress, train
 from pipelines.nerf.training.state import TrainingState, initial_state
+from tests.threads import torch_threads
 from tests.unit.pipelines.nerf.engines.gpu.taped_graphs import Tape, TapedGraphs
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
@@ -39,10 +40,8 @@ Spoil = Callable[[TrainingState], None]
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
     """Small tensors gain nothing from more; on a busy machine threads wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+    with torch_threads(1):
+        yield
 
 
 def config_of(engine: str) -> TrainConfig:

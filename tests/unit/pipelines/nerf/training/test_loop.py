@@ -29,6 +29,7 @@ from pipelines.nerf.training.loop import (
     train,
 )
 from pipelines.nerf.training.state import initial_state, learning_rate
+from tests.threads import torch_threads
 from tests.unit.pipelines.nerf.toy_scene import (
     RADIUS,
     SIZE,
@@ -120,6 +121,7 @@ class _StopError(Exception):
 
 
 @pytest.mark.parametrize("engine", ["plain", "fast"])
+@torch_threads(2)
 def test_a_resumed_run_ends_as_an_uninterrupted_one(
     images: ImageData, cameras: Cameras, tmp_path: Path, engine: str
 ) -> None:

@@ -17,6 +17,7 @@ from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.networks.fields import DensityField
 from pipelines.nerf.options.render import ALL_SAMPLES, RenderConfig
 from pipelines.nerf.space.rays import Rays
+from tests.threads import torch_threads
 from tests.unit.pipelines.nerf.engines.cpu.parts.test_hash_grid import random_model, random_rays
 
 CELLS = 10
@@ -194,14 +195,10 @@ def test_a_ray_shows_the_same_whatever_the_threads_and_its_company() -> None:
     model, rays = random_model(), random_rays(100)
     packed = pack_model(model, options=RenderConfig(baked_cells=CELLS))
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
+    with torch_threads(1):
         alone = render_rays(packed, origins, directions)
-        torch.set_num_threads(2)
+    with torch_threads(2):
         together = render_rays(packed, origins, directions)
-    finally:
-        torch.set_num_threads(before)
     parts = [
         render_rays(packed, origins[begin : begin + 7], directions[begin : begin + 7])
         for begin in range(0, 100, 7)

@@ -1,0 +1,3 @@
+from tests.threads import two_threads
+
+__all__ = ["two_threads"]
