@@ -25,9 +25,9 @@ up: install ## Keep the service running here: make up [PORT=8000] [HOST=0.0.0.0]
 
 test: install-test ## Install what the tests need and run them all
 	@# A process for each core: more threads than that would only wait for each other.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile tests --ignore tests/integration --ignore tests/e2e
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 15 --numprocesses auto --dist loadfile tests --ignore tests/integration --ignore tests/e2e
 	@# Whole jobs first, in one process: what waits more than it computes is done beside them.
-	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder tests/e2e tests/integration
+	@$(BIN)/python -m pytest --durations 15 --numprocesses auto --dist loadfile --no-loadscope-reorder tests/e2e tests/integration
 
 check: install-test ## Lint, types and import rules
 	@$(BIN)/ruff format --check .

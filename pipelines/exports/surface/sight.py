@@ -24,6 +24,8 @@ class Sight:
             _core.Tensor(np.ascontiguousarray(vertices, np.float32)),
             _core.Tensor(np.ascontiguousarray(faces, np.uint32)),
         )
+        # The first question builds what answers all; several threads may ask the next ones.
+        self.reached(np.zeros(3), np.ones((1, 3)))
 
     def reached(self, eye: Floats, targets: Floats) -> NDArray[np.bool_]:
         """Whether nothing lies between an eye [3] and targets [N, 3]."""
