@@ -60,6 +60,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.database = self.open_database()
         self.when = T0
         self.claims: list[Claim] = []
+        self.ends: dict[tuple[str, int], str] = {}
         with self.database.session_scope() as session:
             self.job = make_job(session, DIAMOND, when=T0, max_attempts=2).id
 
@@ -118,15 +119,21 @@ class AnyOrder(RuleBasedStateMachine):
             "cancel": lambda s: cancel_stage(s, claim, when=self.when),
         }
         newest = max(old.token for old in self.claims if old.stage_id == claim.stage_id)
+        run, end = (claim.stage_id, claim.token), "error" if what in ("retry", "fail") else what
         before = self._states(), self._num_events()
         try:
             with self.database.session_scope() as session:
                 holds[what](session)
         except LostLeaseError:
-            pass
-        # Who says again how it ended, as the answer was lost, is answered, but nothing happens.
-        if claim.token != newest:
-            assert (self._states(), self._num_events()) == before, "a stale claim wrote"
+            assert (self._states(), self._num_events()) == before, "a void claim wrote"
+            return
+        if run in self.ends:
+            # Who says again how it ended, as the answer was lost, is answered; nothing happens.
+            assert self.ends[run] == end, "a claim ended twice"
+            assert (self._states(), self._num_events()) == before, "an end was written twice"
+        else:
+            assert claim.token == newest, "a stale claim wrote"
+            self.ends[run] = end
 
     @rule(name=st.sampled_from([stage.name for stage in DIAMOND]), worker=st.sampled_from(WORKERS))
     def deliver(self, name: str, worker: str) -> None:
