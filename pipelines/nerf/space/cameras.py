@@ -41,7 +41,7 @@ MAX_PANORAMA = 1.01
 """Share of the sphere that an equirectangular picture may cover: all of it, and rounding."""
 LENS_GRID = 13
 """Points along each side of a picture at which its lens is tried out, corners included."""
-REMEMBERED_PX = 4_000_000
+REMEMBERED_PX = 1_000_000
 """Pictures of at most so many have the rays of their lens remembered, at 12 bytes each."""
 
 
