@@ -9,9 +9,7 @@ OpenGL axes. The sample's take is filmed where none is named.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from os import cpu_count
 from pathlib import Path
 from subprocess import Popen
@@ -24,6 +22,7 @@ from numpy.typing import NDArray
 from pipelines.errors import ToolError
 from pipelines.sample.scene import SAMPLE, Floats, pose_matrix, render
 from pipelines.sample.takes import Take, looking_at, sway
+from pipelines.scene.ahead import ahead
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.tools.ffmpeg import ffmpeg_executable
 
@@ -132,20 +131,12 @@ def render_all(
     cameras: of `walk` through that take. num_threads: one per processor where not given.
     """
     workers = num_threads or cpu_count() or 1
-    waiting: deque[Future[Picture]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for image, gain in zip(cameras.images, cameras.notes["gains"], strict=True):
-                camera = cameras.cameras[image.camera]
-                pose = pose_matrix(image)
-                waiting.append(pool.submit(render, camera, pose, take.scene, gain))
-                if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
+
+    def picture(shot: tuple[PosedImage, float]) -> Picture:
+        image, gain = shot
+        return render(cameras.cameras[image.camera], pose_matrix(image), take.scene, gain)
+
+    return ahead(picture, zip(cameras.images, cameras.notes["gains"], strict=True), workers)
 
 
 def film_capture(

@@ -7,25 +7,19 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from pipelines.nerf.engines.cpu.parts.runtime import num_threads
-
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-_MOST_THREADS = 4
-"""Each may have threads of its own, as of a ray caster."""
-
 
 def ahead(
-    work: Callable[[_Item], _Result], items: Iterable[_Item]
+    work: Callable[[_Item], _Result], items: Iterable[_Item], threads: int
 ) -> Generator[_Result, None, None]:
-    """`work` of each item, in their order, on as many threads as torch has, or a few.
+    """`work` of each item, in their order, on so many threads; on the caller's own for one.
 
     What lets go of the interpreter's lock, as large arrays, files and rays do, is done side by
     side. So much is held at a time: a result for each thread, and the one that is asked for. What
     `work` raises is raised in its turn; whoever stops asking waits for what was begun.
     """
-    threads = min(num_threads(), _MOST_THREADS)
     if threads == 1:
         yield from map(work, items)
         return

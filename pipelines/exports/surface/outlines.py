@@ -25,6 +25,7 @@ carry a wall along: seen at a grazing angle it goes many pixels along the ray fo
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -34,12 +35,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
+from pipelines.exports.each_view import each_view
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.surface.flatness import NOWHERE, find_flat_parts
 from pipelines.exports.surface.outline_views import Answers, OutlineView
 from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
-from pipelines.scene.ahead import ahead
 from pipelines.scene.stereo_views import ColorView
 
 Floats = NDArray[np.float64]
@@ -98,13 +99,9 @@ def outlined(
     on_plane = flat_parts.plane_of != NOWHERE
     for index, step in enumerate(_ROUNDS):
         sight = Sight(vertices, mesh.faces)
-
-        def asked(view: ColorView, sight: Sight = sight, step: _Round = step) -> Answers:
-            seen = OutlineView(sight, corner_colors, view.reduced(step.factor), origin)
-            return seen.answers(step.begins)
-
+        ask = functools.partial(_answers, sight, corner_colors, origin, step)
         parts = []
-        for number, part in enumerate(ahead(asked, views)):
+        for number, part in enumerate(each_view(ask, views)):
             parts.append(part)
             done = (1.0 - _SOLVE_SHARE) * (number + 1) / len(views)
             on_progress((index + done) / len(_ROUNDS))
@@ -113,6 +110,14 @@ def outlined(
         vertices = vertices + _moves(answers, rings, step.stiffness, *holds)
         on_progress((index + 1) / len(_ROUNDS))
     return replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
+
+
+def _answers(
+    sight: Sight, corner_colors: NDArray[np.float32], origin: Floats, step: _Round, view: ColorView
+) -> Answers:
+    """What one view says in a round. The rest as `OutlineView` has it."""
+    seen = OutlineView(sight, corner_colors, view.reduced(step.factor), origin)
+    return seen.answers(step.begins)
 
 
 def _pixels(vertices: Floats, views: Sequence[ColorView], origin: Floats) -> Floats:

@@ -21,13 +21,13 @@ import open3d
 from numpy.typing import NDArray
 
 from pipelines.exports.apart import run_apart
+from pipelines.exports.each_view import each_view
 from pipelines.exports.mesh import Floats, TriangleMesh, empty_mesh, ordered
 from pipelines.exports.surface import poisson_solver
 from pipelines.exports.surface.cloud import Cloud, with_normals
 from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 from pipelines.exports.surface.tsdf import Sized
 from pipelines.exports.surface.view_colors import seen_colors
-from pipelines.scene.ahead import ahead
 from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.consistency import consistent
 from pipelines.scene.depth_views import DepthView
@@ -150,7 +150,7 @@ def averaged(
     while True:
         sums = _Sums(np.zeros(0, np.int64), np.zeros((0, 9)), np.zeros(0, np.int64))
         counts = np.ceil((bounds.box_max - bounds.box_min) / side).astype(np.int64) + 1
-        shown = ahead(functools.partial(_means, bounds, side, counts), views)
+        shown = each_view(functools.partial(_means, bounds, side, counts), views)
         for done, (key, mean) in enumerate(shown):
             on_progress(1.0 - left * (1.0 - 0.5 * done / len(views)))
             sums = sums.with_one_more(key, mean)

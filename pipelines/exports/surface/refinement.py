@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import cg
 
+from pipelines.exports.each_view import each_view
 from pipelines.exports.mesh import TriangleMesh, unit_normals
 from pipelines.exports.surface import fairing
 from pipelines.exports.surface.flatness import NOWHERE, Answers, find_flat_parts, flattened
@@ -36,7 +37,6 @@ from pipelines.exports.surface.rings import MeshRings
 from pipelines.exports.surface.sight import Sight
 from pipelines.nerf.stereo.refinement import Offsets, Pictures, photo_offsets
 from pipelines.nerf.stereo.views import StereoView
-from pipelines.scene.ahead import ahead
 
 Floats = NDArray[np.float64]
 
@@ -165,7 +165,7 @@ def _seen(
         return shown
 
     seen = np.zeros((len(views), len(vertices)), np.uint8)
-    for index, shown in enumerate(ahead(seen_by, views)):
+    for index, shown in enumerate(each_view(seen_by, views)):
         seen[index] = shown
         on_view((index + 1) / len(views))
     return seen

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.exports.each_view import each_view
 from pipelines.exports.mesh import Floats, TriangleMesh
 from pipelines.exports.surface.tsdf import Sized
-from pipelines.scene.ahead import ahead
 from pipelines.scene.depth_views import DepthView
 from pipelines.scene.picture_sampling import between_pixels
 
@@ -31,7 +31,7 @@ def seen_colors(
     """
     count = np.zeros(len(mesh.vertices), np.int32)
     weight, total = np.zeros((len(mesh.vertices), 1)), np.zeros((len(mesh.vertices), 3))
-    shown = ahead(lambda view: _shown(mesh, view, beside), views)
+    shown = each_view(lambda view: _shown(mesh, view, beside), views)
     for done, (which, cosine, colors) in enumerate(shown, start=1):
         count[which] += 1
         weight[which] += cosine[:, None]

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.exports.each_view import each_view
 from pipelines.exports.surface.sight import Sight
 from pipelines.exports.texture.photos import Photos, colors_at, sharpness, softened
-from pipelines.scene.ahead import ahead
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.int32]
@@ -105,7 +105,7 @@ def choose_photos(
 ) -> Ints:
     """The photo of each face, [F]; `NOBODY` where none shows it whole. on_progress: may raise."""
     candidates = _Candidates.none(len(surface.faces))
-    looks = ahead(functools.partial(_look, surface, photos), range(len(photos)))
+    looks = each_view(functools.partial(_look, surface, photos), range(len(photos)))
     for index, (faces, score, color) in enumerate(looks):
         candidates.offer(faces, index, score, color)
         on_progress((index + 1) / len(photos))
@@ -124,6 +124,8 @@ def _look(
     pixels, inside = photos.pixels(index, surface.vertices)
     faces = np.flatnonzero(facing & _all_of(inside, surface.faces))
     faces = faces[surface.unhindered(eye, faces)]
+    if len(faces) == 0:
+        return faces, np.zeros(0), np.zeros((0, 3), np.float32)
     corners = pixels[surface.faces[faces]]
     middle = corners.mean(axis=1)
     kept = photos.usable(index, middle)

@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from pipelines.exports.each_view import each_view
 from pipelines.exports.texture.charts import MARGIN_PX, Charts, Layout
 from pipelines.exports.texture.choice import NOBODY, Surface
 from pipelines.exports.texture.photos import Photos
 from pipelines.exports.texture.texels import moving, spread
-from pipelines.scene.ahead import ahead
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -259,7 +259,7 @@ def _looks(
         level = np.clip(np.rint(np.log2(wanted)).astype(np.int64), 1, _COPIES) - 1
         return (0.5 * places, level, colors[kept]), bare
 
-    for index, (shown, bare) in enumerate(ahead(look, range(len(photos)))):
+    for index, (shown, bare) in enumerate(each_view(look, range(len(photos)))):
         texels.add(*shown)
         vertices.add(*bare)
         on_progress((index + 1) / len(photos))
