@@ -12,13 +12,16 @@ MINUTES ?= 5
 export CAPTURE HOST PORT
 
 .DEFAULT_GOAL := help
-.PHONY: help demo up test check fix chaos mutants install install-test lock clean
+.PHONY: help demo there-is-a-capture up test check fix chaos mutants install install-test lock clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
 
-demo: install ## Run one capture through the whole service: make demo [CAPTURE=path]
+demo: there-is-a-capture install ## Run one capture through the whole service: make demo [CAPTURE=path]
 	@$(BIN)/python -m deploy.demo
+
+there-is-a-capture: # before minutes of installing
+	@test -z "$$CAPTURE" || test -f "$$CAPTURE" || { echo "There is no file $$CAPTURE. CAPTURE is a video, or a .zip of photos." >&2; exit 2; }
 
 up: install ## Keep the service running here: make up [PORT=8000] [HOST=0.0.0.0]
 	@$(BIN)/python -m deploy.local

@@ -73,9 +73,6 @@ def main() -> int:
     """Run the demo. Returns the process's exit status."""
     console = Console()
     wanted = os.environ.get("CAPTURE", "")
-    if wanted and not Path(wanted).is_file():
-        console.print(f"There is no file {wanted}. CAPTURE is a video, or a .zip of photos.")
-        return 2
     signal.signal(signal.SIGTERM, _raise_stopped)
     signal.signal(signal.SIGHUP, _raise_stopped)
     base = default_home()

@@ -194,7 +194,7 @@ def test_a_model_on_a_gpu_shows_the_same_picture() -> None:
         pytest.skip("needs a CUDA device")
     cameras = two_cameras()
     on_cpu = Renderer(random_model(), SCENE, engine="plain").render(cameras, 1)
-    on_gpu = Renderer(random_model(), SCENE, device="cuda").render(cameras, 1)
+    on_gpu = Renderer(random_model(), SCENE, engine="plain", device="cuda").render(cameras, 1)
     assert_same(on_cpu, on_gpu)
     drawn = Renderer(random_model(), SCENE, engine="fast", device="cuda", config=ALL_SAMPLES)
     # Tables are read in half precision there.
