@@ -24,7 +24,7 @@ from storage.settings import StorageSettings
 from worker.app import make_app
 from worker.consumer import ConsumerLink
 from worker.cores import num_cores
-from worker.housekeeping import detect_gpu
+from worker.gpu import find_gpu
 from worker.runtime import WorkerIdentity, WorkerRuntime, set_current_runtime
 from worker.settings import WorkerSettings
 
@@ -95,12 +95,19 @@ def main(arguments: list[str] | None = None) -> None:
     storage = StorageSettings()
     upgrade(storage.resolved_database_url)  # whoever starts first makes the schema
     link = ConsumerLink()
-    has_gpu = detect_gpu()
+    settings = WorkerSettings()
+    has_gpu = find_gpu(storage, settings)
     slots = chosen.slots or default_slots(has_gpu, num_cores())
+    identity = WorkerIdentity.of(chosen.id, slots, chosen.queues, has_gpu)
+    if not identity.queues:
+        sys.exit(
+            "This worker serves only the queue gpu, and there is no GPU here that its stages can "
+            "use. Start it with --queues cpu,light, or where there is one."
+        )
     runtime = WorkerRuntime(
-        WorkerIdentity.of(chosen.id, slots, chosen.queues, has_gpu),
+        identity,
         storage,
-        WorkerSettings(),
+        settings,
         registry=os.environ.get("NERFWORKS_REGISTRY", "pipelines.registry"),
         on_unheard=link.reconnect,
     )

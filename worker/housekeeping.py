@@ -13,13 +13,10 @@ when several workers do it, because the database decides.
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import logging
-import os
 import secrets
 import shutil
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -40,24 +37,6 @@ from worker.settings import WorkerSettings
 
 _log = logging.getLogger("nerfworks.worker")
 GONE = ".gone-"
-
-
-def detect_gpu() -> bool:
-    """Whether this machine has an NVIDIA device that our torch could use. Imports no torch."""
-    if os.environ.get("CUDA_VISIBLE_DEVICES", "0").strip() in ("", "-1"):
-        return False
-    try:
-        if importlib.metadata.version("torch").endswith("+cpu"):
-            return False
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    if any(Path("/dev").glob("nvidia[0-9]*")):
-        return True
-    try:
-        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, timeout=20, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-    return listed.returncode == 0 and b"GPU" in listed.stdout
 
 
 def is_ring_due(stage: WaitingStage, moment: datetime, again_s: float) -> bool:

@@ -6,13 +6,14 @@ Called by a stage process before it loads anything of a stage, and by what compi
 from __future__ import annotations
 
 import errno
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from worker.containment import landlock, seccomp
-from worker.containment.landlock import DEVICE, LIST, READ, WRITE, Rule
+from worker.containment.landlock import DEVICE, LIST, NAME, READ, WRITE, Rule
 from worker.containment.limits import apply_limits
 from worker.containment.plan import Plan
 from worker.containment.privileges import drop_capabilities, forgo_new_privileges
@@ -39,9 +40,21 @@ class ContainmentError(RuntimeError):
     """The worker is told that stages must be contained, and this machine cannot."""
 
 
+_THREADS = Path("/proc/self/task")
+_held: list[int] = []
+"""Descriptors that stay open: a rule is for an inode, and the kernel makes another one for a folder
+of /proc that nobody holds."""
+
+
 def _rules(plan: Plan) -> list[Rule]:
     groups = ((plan.read, READ), (plan.list, LIST), (plan.write, WRITE), (plan.devices, DEVICE))
-    return [Rule(Path(path), allowed) for paths, allowed in groups for path in paths]
+    rules = [Rule(Path(path), allowed) for paths, allowed in groups for path in paths]
+    if plan.names_threads:
+        # NVIDIA's driver names its threads by writing to a file of theirs (`comm`), and does not
+        # start at all (CUDA error 304) where it must not.
+        _held.append(os.open(_THREADS, os.O_PATH | os.O_CLOEXEC))
+        rules.append(Rule(_THREADS, NAME))
+    return rules
 
 
 def _limit(plan: Plan) -> str:

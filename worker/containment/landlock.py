@@ -43,6 +43,7 @@ WRITE |= MAKE_DIR | MAKE_REG | REFER
 """Neither links of the symbolic kind, which whoever reads the folder would follow, nor devices, nor
 programs to be started."""
 DEVICE = READ_FILE | READ_DIR | WRITE_FILE | IOCTL_DEV
+NAME = READ_FILE | WRITE_FILE | TRUNCATE
 
 
 class _Ruleset(ctypes.Structure):
@@ -60,7 +61,7 @@ class _PathBeneath(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Rule:
-    """What a path, and all below it, may be used for. allowed: READ, LIST, WRITE, DEVICE."""
+    """What a path, and all below it, may be used for. allowed: READ, LIST, WRITE, DEVICE, NAME."""
 
     path: Path
     allowed: int

@@ -13,7 +13,8 @@ from worker.containment.limits import Limits
 @dataclass(frozen=True)
 class Plan:
     """For a stage process. mode: see `WorkerSettings.contain`. read, list, write, devices: paths,
-    and what is below them. network, unix_sockets: whether such may be opened."""
+    and what is below them. network, unix_sockets: whether such may be opened. names_threads: if it
+    may name its own threads."""
 
     mode: str
     read: tuple[str, ...]
@@ -23,6 +24,7 @@ class Plan:
     limits: Limits
     network: bool
     unix_sockets: bool
+    names_threads: bool
     environment: Mapping[str, str]
 
     def to_json(self) -> str:

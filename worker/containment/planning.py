@@ -33,6 +33,7 @@ from worker.settings import WorkerSettings
 _SYSTEM = (
     *("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/nix/store", "/gnu/store"),
     *("/opt/rocm", "/opt/nvidia", "/opt/cuda", "/opt/intel", "/run/opengl-driver", "/run/nvidia"),
+    "/run/nvidia-persistenced",
     *("/proc", "/sys"),
 )
 _SETTINGS = (
@@ -48,6 +49,8 @@ _CACHE_NAMES = (
     "TORCHINDUCTOR_CACHE_DIR",
 )
 _WEIGHTS = "NERFWORKS_LPIPS_WEIGHTS"
+_GPU_EXPECTED = "NERFWORKS_GPU_EXPECTED"
+"""`pipelines.nerf.devices`, whose import takes PyTorch."""
 
 
 def _children(folder: Path) -> list[Path]:
@@ -159,6 +162,8 @@ def make_plan(
     home = storage.home.resolve() / "cache" / "home"
     names = [name.strip() for name in settings.stage_environment.split(",") if name.strip()]
     given = stage_environment(environment, home=home, more=names)
+    if has_gpu:
+        given[_GPU_EXPECTED] = "1"
     private = _private_paths(storage)
     weights = [part.strip() for part in environment.get(_WEIGHTS, "").split(",") if part.strip()]
     remote = any("://" in source for source in weights)
@@ -201,5 +206,6 @@ def make_plan(
         ),
         network=remote,
         unix_sockets=has_gpu,
+        names_threads=has_gpu,
         environment=given,
     )

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -58,6 +59,22 @@ def _write(ctx: StageContext, path: str) -> str:
     with open(path, "w") as file:
         file.write("nosy")
     return "written"
+
+
+def _name_thread(ctx: StageContext) -> str:
+    """Name another thread, as glibc does for whoever asks for it."""
+    end = threading.Event()
+    other = threading.Thread(target=end.wait, daemon=True)
+    other.start()
+    path = Path(f"/proc/self/task/{other.native_id}/comm")
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+        os.write(descriptor, b"nosy")
+        os.close(descriptor)
+        return path.read_text().strip()
+    finally:
+        end.set()
+        other.join()
 
 
 def _peek(ctx: StageContext, pid: int) -> str:
@@ -172,6 +189,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "read": _read,
     "read_by_program": _read_by_program,
     "write": _write,
+    "name_thread": _name_thread,
     "peek": _peek,
     "trace": _trace,
     "connect": _connect,

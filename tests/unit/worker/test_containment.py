@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipelines.nerf.devices import GPU_EXPECTED
 from pipelines.workspace import Workspace
 from storage.settings import StorageSettings
 from tests.integration.engine import is_running
@@ -46,11 +47,11 @@ signals_closed = pytest.mark.skipif(landlock.version() < 6, reason="needs Landlo
 class Nosy:
     """A home with secrets, and a stage process beside it that tries what it is told."""
 
-    def __init__(self, folder: Path, **settings: Any) -> None:
+    def __init__(self, folder: Path, *, has_gpu: bool = False, **settings: Any) -> None:
         self.home = folder / "home"
         self.storage = StorageSettings(home=self.home)
         self.plan = make_plan(
-            self.storage, WorkerSettings(**settings), self.environment(), has_gpu=False
+            self.storage, WorkerSettings(**settings), self.environment(), has_gpu=has_gpu
         )
         for name in ("secrets.json", "signing.key", "logs/worker.log", "objects/captures/c"):
             path = self.home / name
@@ -168,6 +169,24 @@ def test_a_stage_writes_to_its_job_and_caches_alone(nosy: Nosy, tmp_path: Path) 
     orders = [["write", str(path)] for path in elsewhere]
     assert nosy.ask(*orders) == ["PermissionError"] * len(orders)
     assert (nosy.home / "secrets.json").read_text() == SECRET
+
+
+@linux
+@files_closed
+def test_with_a_gpu_a_stage_names_its_own_threads_and_nothing_more_of_the_kernels_is_open(
+    nosy: Nosy, tmp_path: Path
+) -> None:
+    """NVIDIA's driver does so as it starts, and does not start where it must not."""
+    assert nosy.ask(["name_thread"]) == ["PermissionError"]
+    beside = Nosy(tmp_path, has_gpu=True)
+    try:
+        # Twice: the kernel may forget a folder of /proc that nobody holds, and the rule with it.
+        assert beside.ask(["name_thread"], ["name_thread"]) == ["nosy", "nosy"]
+        theirs = f"/proc/{os.getpid()}/task/{os.getpid()}/comm"
+        closed = ["/proc/sys/kernel/core_pattern", theirs, "/proc/self/oom_score_adj"]
+        assert beside.ask(*(["write", path] for path in closed)) == ["PermissionError"] * 3
+    finally:
+        beside.process.kill()
 
 
 @linux
@@ -376,6 +395,7 @@ def test_a_plan_survives_its_way_to_the_process(tmp_path: Path) -> None:
     assert Plan.of_json(plan.to_json()) == replace(plan, environment={})
     assert plan.limits.memory_bytes == 0, "CUDA writes to address space that it only reserves"
     assert plan.unix_sockets
+    assert plan.environment[GPU_EXPECTED]
 
 
 def test_without_containment_the_log_says_so(tmp_path: Path) -> None:

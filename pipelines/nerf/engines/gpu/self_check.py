@@ -159,8 +159,9 @@ def engine_errors() -> tuple[type[Exception], ...]:
 
 def relative_gap(found: Tensor, expected: Tensor) -> float:
     """|found - expected| / |expected| by Euclidean norms; 0 where both vanish."""
-    size = float(expected.double().norm())
-    gap = float((found.double() - expected.double()).norm())
+    found, expected = found.detach().double(), expected.detach().double()
+    size = float(expected.norm())
+    gap = float((found - expected).norm())
     return gap / size if size > 0.0 else (0.0 if gap == 0.0 else math.inf)
 
 

@@ -1,0 +1,45 @@
+"""`python -m worker.gpu_trial`: computes something on the GPU, or says in a line why it cannot.
+
+Started by `worker.gpu` in a process as contained as a stage's. Exit code 1 where it cannot.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+
+def driver_problem() -> str | None:
+    """Why NVIDIA's driver does not start in this process; None where it does."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError as error:
+        return f"the driver's library cannot be loaded: {error}"
+    if status := int(driver.cuInit(0)):
+        text = ctypes.c_char_p()
+        driver.cuGetErrorString(status, ctypes.byref(text))
+        return f"the driver does not start: CUDA error {status}, {(text.value or b'?').decode()}"
+    return None
+
+
+def torch_problem() -> str | None:
+    """Why PyTorch cannot compute on the GPU; None where it can."""
+    import torch  # takes seconds, and a driver that does not start needs none of it
+
+    try:
+        total = float(torch.ones(1000, device="cuda").sum())
+    except (RuntimeError, AssertionError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        return f"PyTorch {torch.__version__} cannot compute on it: {reason}"
+    return None if total == 1000.0 else f"PyTorch adds 1000 ones up to {total} on it"
+
+
+def main() -> None:
+    """Try, and tell."""
+    if problem := driver_problem() or torch_problem():
+        print(problem)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
