@@ -110,7 +110,7 @@ PIPELINE_ROOMS: tuple[tuple[str, ...], ...] = (
 NERF_ROOMS: tuple[tuple[str, ...], ...] = (
     ("errors",),
     ("plugins",),
-    ("devices",),
+    ("devices", "ahead"),
     ("options",),
     ("space",),
     ("along_ray",),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
+from pipelines.nerf.ahead import ahead
 from pipelines.nerf.engines.cpu.parts.runtime import num_threads
-from pipelines.scene.ahead import ahead
 
 _View = TypeVar("_View")
 _Answer = TypeVar("_Answer")

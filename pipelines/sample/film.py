@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ToolError
+from pipelines.nerf.ahead import ahead
 from pipelines.sample.scene import SAMPLE, Floats, pose_matrix, render
 from pipelines.sample.takes import Take, looking_at, sway
-from pipelines.scene.ahead import ahead
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.tools.ffmpeg import ffmpeg_executable
 

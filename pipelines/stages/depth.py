@@ -22,6 +22,7 @@ from PIL import Image
 
 from pipelines.errors import TrainingError
 from pipelines.exports.shades import depth_picture, depth_range
+from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.data.images import split_indices
 from pipelines.nerf.data.light import Light
 from pipelines.nerf.judging.off_path import evenly
@@ -123,11 +124,15 @@ class _Search:
     ) -> _Search:
         """Load the images, and what an attempt before has found."""
         started = time.monotonic()
-        views: list[StereoView] = []
-        for index, image in enumerate(images):
+
+        def load(image: PosedImage) -> StereoView:
             lens, root = capture.cameras[image.camera], ctx.workspace.images_root
-            views.append(stereo_view(root, image, lens, config.long_side_px))
-            ctx.progress(_LOAD_SHARE * (index + 1) / len(images), "loading images")
+            return stereo_view(root, image, lens, config.long_side_px)
+
+        views: list[StereoView] = []
+        for view in each_ahead(load, images):
+            views.append(view)
+            ctx.progress(_LOAD_SHARE * len(views) / len(images), "loading images")
         with nerf_errors_as(TrainingError):
             engine = choose_engine(views, config)
         files = [image.file for image in images]
@@ -297,9 +302,8 @@ def _light(search: _Search, maps: MapShelf) -> tuple[list[Light | None], dict[st
     points = surface_points(views, maps.z)
     if len(points) == 0:
         return nothing, None
-    for index in range(len(views)):
-        on_progress(0.5 * index / len(views))
-        search.color_picture(index)
+    for index, _ in enumerate(each_ahead(search.color_picture, range(len(views)))):
+        on_progress(0.5 * (index + 1) / len(views))
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
     light = find_light(
         views, maps.z, search.colors, neighbours, lambda share: on_progress(0.5 + 0.5 * share)

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
 from pipelines.nerf.stereo.engines import KERNELS, Engine
@@ -24,7 +25,7 @@ from pipelines.nerf.stereo.maps import (
     votes_of_others,
 )
 from pipelines.nerf.stereo.neighbours import choose_neighbours
-from pipelines.nerf.stereo.patches import even_patches, shelved_patches
+from pipelines.nerf.stereo.patches import Labels, even_patches, shelved_patches
 from pipelines.nerf.stereo.planes import (
     ON_PLANE,
     Depths,
@@ -68,8 +69,12 @@ def completed(
         on_progress(begin + (end - begin) * share, _MESSAGE)
 
     filled = shelves.scratch("on planes", len(views))
-    for index, (view, z) in enumerate(zip(views, depths_of(maps), strict=True)):
-        filled[index] = laid_on_planes(view, z, planes, shelved_patches(view, index, patches))
+
+    def lay(index: int) -> None:
+        parts = shelved_patches(views[index], index, patches)
+        filled[index] = laid_on_planes(views[index], maps[index].z, planes, parts)
+
+    for index, _ in enumerate(each_ahead(lay, range(len(views)))):
         share_done(_SAMPLES_SHARE, _LAID_SHARE, (index + 1) / len(views))
     normal = upwards(views, planes) if config.level_tops else None
     if normal is not None:
@@ -134,15 +139,23 @@ def _lay_on_tops(
 
     floor: what `Rims.tops` is told of it.
     """
+
+    def even(index: int) -> Labels:
+        return even_patches(views[index].picture, shelved_patches(views[index], index, patches))
+
     rims = Rims()
-    for index, (view, z) in enumerate(zip(views, depths, strict=True)):
-        rims.add(view, z, even_patches(view.picture, shelved_patches(view, index, patches)))
+    parts = each_ahead(even, range(len(views)))
+    for index, (view, z, labels) in enumerate(zip(views, depths, parts, strict=True)):
+        rims.add(view, z, labels)
         on_share(0.5 * (index + 1) / len(views))
     tops = rims.tops(*floor)
     if len(tops) == 0:
         return
-    for index, (view, z) in enumerate(zip(views, depths, strict=True)):
-        even = even_patches(view.picture, shelved_patches(view, index, patches))
-        laid = laid_on_tops(view, z, tops, even)
+
+    def lay(index: int) -> None:
+        z = depths[index]
+        laid = laid_on_tops(views[index], z, tops, even(index))
         filled[index] = np.where(laid != z, laid, filled[index])
+
+    for index, _ in enumerate(each_ahead(lay, range(len(views)))):
         on_share(0.5 + 0.5 * (index + 1) / len(views))

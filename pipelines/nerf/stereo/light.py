@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.data.light import Light, exposed, in_logarithms, is_measurable
 from pipelines.nerf.stereo.shelves import ByView
 from pipelines.nerf.stereo.views import StereoView
@@ -84,15 +85,21 @@ def find_light(
     each view those it is compared with. The bend is the one with which levelled pictures differ
     least. on_progress: told the share that is done; may raise.
     """
-    shared = []
-    for index, view in enumerate(views):
-        on_progress(_COMPARING * index / len(views))
-        points, colors = _known_points(view, depths[index], pictures[index])
+
+    def compare(index: int) -> list[_Shared]:
+        points, colors = _known_points(views[index], depths[index], pictures[index])
+        pairs = []
         for other in neighbours[index]:
             same, there = _seen_too(points, views[other], depths[other], pictures[other])
             if len(same) >= _MIN_SHARED:
                 step = max(1, len(same) // _MOST_SHARED)
-                shared.append(_Shared(index, other, colors[same[::step]], there[::step]))
+                pairs.append(_Shared(index, other, colors[same[::step]], there[::step]))
+        return pairs
+
+    shared = []
+    for index, pairs in enumerate(each_ahead(compare, range(len(views)))):
+        shared += pairs
+        on_progress(_COMPARING * index / len(views))
     if not shared:
         return CaptureLight(np.ones((len(views), 3)))
     tried = []

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.engines.cpu.stereo.neighbours import pair_scores_fast
 from pipelines.nerf.stereo.views import StereoView, camera_extent
 
 Floats = NDArray[np.float64]
@@ -40,21 +41,41 @@ def choose_neighbours(
     toward = points[None] - centers[:, None]
     toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-12)
     facing = axes @ axes.T > np.cos(np.radians(_MAX_AXIS_DEG))
+    scores = pair_scores_fast(toward, shown, facing, best_angle_deg, (_BELOW_DEG, _ABOVE_DEG))
     chosen = []
-    for index in range(len(views)):
-        mine = shown[index]
-        if not mine.any():
+    for index, score in enumerate(scores):
+        if not shown[index].any():
             chosen.append(_nearest(centers, facing, index, count))
             continue
-        cosines = np.einsum("vpc,pc->vp", toward[:, mine], toward[index, mine])
-        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-        spread = np.where(angles < best_angle_deg, _BELOW_DEG, _ABOVE_DEG)
-        liked = np.exp(-0.5 * ((angles - best_angle_deg) / spread) ** 2) * shown[:, mine]
-        score = liked.mean(axis=1) * facing[index]
-        score[index] = 0.0
         order = np.argsort(-score, kind="stable")[:count]
         chosen.append([int(other) for other in order if score[other] > _LEAST_SCORE])
     return chosen
+
+
+def pair_scores(
+    toward: Floats,
+    shown: NDArray[np.bool_],
+    facing: NDArray[np.bool_],
+    best_angle_deg: float,
+    spread_deg: tuple[float, float],
+) -> Floats:
+    """The scores [V, V] of `choose_neighbours`, of the first with the second; its definition.
+
+    toward: [V, P, 3], unit, from each view's centre to each point. shown: [V, P], whether the view
+    has it in its picture. facing: [V, V]; pairs that look elsewhere score 0. spread_deg: s below
+    and above the best angle.
+    """
+    scores = np.zeros((len(shown), len(shown)))
+    for index, mine in enumerate(shown):
+        if not mine.any():
+            continue
+        cosines = np.einsum("vpc,pc->vp", toward[:, mine], toward[index, mine])
+        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+        spread = np.where(angles < best_angle_deg, *spread_deg)
+        liked = np.exp(-0.5 * ((angles - best_angle_deg) / spread) ** 2) * shown[:, mine]
+        scores[index] = liked.mean(axis=1) * facing[index]
+    np.fill_diagonal(scores, 0.0)
+    return scores
 
 
 def _nearest(centers: Floats, facing: NDArray[np.bool_], index: int, count: int) -> list[int]:

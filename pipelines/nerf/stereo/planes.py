@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.stereo.maps import DepthMap
 from pipelines.nerf.stereo.patches import Labels
 from pipelines.nerf.stereo.shelves import ByView
@@ -181,12 +182,17 @@ def _samples(
     on_progress: Callable[[float], None],
 ) -> tuple[Floats, Floats, Floats]:
     """(points [K, 3], unit normals [K, 3], both world; depths [K]) of some of the known pixels."""
-    points, normals, depths = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
-    for done, (view, found) in enumerate(zip(views, maps, strict=True), start=1):
-        on_progress(done / len(views))
-        rays = _rays(view)
+
+    def look(index: int) -> tuple[DepthMap, Floats, Floats, NDArray[np.int64]]:
+        found, rays = maps[index], _rays(views[index])
         normal, sure = _normals(rays, found.z)
-        usable = np.flatnonzero(sure & (found.votes >= _MIN_VOTES))
+        return found, rays, normal, np.flatnonzero(sure & (found.votes >= _MIN_VOTES))
+
+    points, normals, depths = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
+    looks = each_ahead(look, range(len(views)))
+    for done, (view, seen) in enumerate(zip(views, looks, strict=True), start=1):
+        on_progress(done / len(views))
+        found, rays, normal, usable = seen
         picked = rng.choice(usable, min(len(usable), _SAMPLES_PER_VIEW), replace=False)
         depth = found.z.ravel()[picked].astype(np.float64)
         turn = view.world_from_camera[:, :3]

@@ -7,6 +7,7 @@ memory to what is being looked at, and a search that was cut short goes on from 
 from __future__ import annotations
 
 import shutil
+import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,7 +34,9 @@ class ByView(Protocol[T_co]):
 
 
 class Shelf(ByView[Any], Protocol):
-    """Arrays of views. Who puts or takes one does not write into it any more."""
+    """Arrays of views. Who puts or takes one does not write into it any more. Several threads may
+    put and take those of different views.
+    """
 
     def has(self, index: int) -> bool:
         """Whether that view's lies there."""
@@ -157,27 +160,31 @@ class FileShelves:
 
 
 class _Recent:
-    """The arrays that were looked at last, by their files."""
+    """The arrays that were looked at last, by their files. For several threads."""
 
     def __init__(self) -> None:
         self._held: OrderedDict[Path, Array] = OrderedDict()
         self._bytes = 0
+        self._lock = threading.Lock()
 
     def find(self, path: Path) -> Array | None:
-        if path in self._held:
-            self._held.move_to_end(path)
-        return self._held.get(path)
+        with self._lock:
+            if path in self._held:
+                self._held.move_to_end(path)
+            return self._held.get(path)
 
     def add(self, path: Path, values: Array) -> None:
-        self._drop(path)
-        self._held[path] = values
-        self._bytes += values.nbytes
-        while self._bytes > _RECENT_BYTES and len(self._held) > 1:
-            self._drop(next(iter(self._held)))
+        with self._lock:
+            self._drop(path)
+            self._held[path] = values
+            self._bytes += values.nbytes
+            while self._bytes > _RECENT_BYTES and len(self._held) > 1:
+                self._drop(next(iter(self._held)))
 
     def forget(self, folder: Path) -> None:
-        for path in [path for path in self._held if path.parent == folder]:
-            self._drop(path)
+        with self._lock:
+            for path in [path for path in self._held if path.parent == folder]:
+                self._drop(path)
 
     def _drop(self, path: Path) -> None:
         dropped = self._held.pop(path, None)

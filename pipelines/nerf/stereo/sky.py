@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.stereo.patch_colors import (
     Bools,
     Bytes,
@@ -78,15 +79,21 @@ def find_sky(
     nothing. patches: a shelf for the pictures' `patches_of`, or with them. on_share: told the share
     that is done; may raise.
     """
+
+    def look(index: int) -> tuple[Bools, bool | None]:
+        view, z = views[index], depths[index]
+        parts = shelved_patches(view, index, patches)
+        mask = like_sky(view, picture_of(index), up, points, parts)
+        if not mask.any() or not (z > 0).any():
+            return mask, None
+        ring = grown(mask, _RING_TO_PX) & ~grown(mask, _RING_FROM_PX) & (z > 0)
+        farthest = np.percentile(z[ring], _FAR_PERCENT) if ring.any() else 0.0
+        return mask, bool(farthest >= _FAR * np.median(z[z > 0]))
+
     found, is_far = [], []
-    for index, view in enumerate(views):
-        mask = like_sky(view, picture_of(index), up, points, shelved_patches(view, index, patches))
-        z = depths[index]
-        if mask.any() and (z > 0).any():
-            ring = grown(mask, _RING_TO_PX) & ~grown(mask, _RING_FROM_PX) & (z > 0)
-            farthest = np.percentile(z[ring], _FAR_PERCENT) if ring.any() else 0.0
-            is_far.append(bool(farthest >= _FAR * np.median(z[z > 0])))
+    for index, (mask, far_behind) in enumerate(each_ahead(look, range(len(views)))):
         found.append(mask)
+        is_far += [] if far_behind is None else [far_behind]
         on_share((index + 1) / len(views))
     far = float(np.mean(is_far)) if is_far else 0.0
     num_views = sum(bool(mask.any()) for mask in found)

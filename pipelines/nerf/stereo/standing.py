@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.segmentation import expand_labels
 
+from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.completing import confirmed
 from pipelines.nerf.stereo.engines import KERNELS, Engine
@@ -127,10 +128,15 @@ def stood_up(
     floors = floors_of(views, planes, points, depths)
     if not floors:
         return maps
-    looks = []
-    for index, (view, z) in enumerate(zip(views, depths_of(maps), strict=True)):
+
+    def look(index: int) -> _Look:
+        view = views[index]
         parts = even_patches(view.picture, shelved_patches(view, index, patches))
-        looks.append(_look(view, z, planes, parts))
+        return _look(view, maps[index].z, planes, parts)
+
+    looks = []
+    for index, found in enumerate(each_ahead(look, range(len(views)))):
+        looks.append(found)
         share = (_LOOK_SHARE - _PLANES_SHARE) * (index + 1) / len(views)
         on_progress(_PLANES_SHARE + share, _MESSAGE)
     walls = _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
@@ -139,8 +145,11 @@ def stood_up(
         return maps
     every, stands_on = _with_walls(planes, walls, float(np.median(depths)))
     filled = shelves.scratch("on walls", len(views))
-    for index, (look, z) in enumerate(zip(looks, depths_of(maps), strict=True)):
-        filled[index] = _laid(look, z, every, stands_on)
+
+    def lay(index: int) -> None:
+        filled[index] = _laid(looks[index], maps[index].z, every, stands_on)
+
+    for index, _ in enumerate(each_ahead(lay, range(len(views)))):
         share = (_LAY_SHARE - _LOOK_SHARE) * (index + 1) / len(views)
         on_progress(_LOOK_SHARE + share, _MESSAGE)
     seen = surface_points(views, depths_of(maps))

@@ -9,9 +9,11 @@ import torch
 from pipelines.nerf.engines.cpu.stereo.aggregation import aggregate_fast
 from pipelines.nerf.engines.cpu.stereo.agreement import count_votes_fast
 from pipelines.nerf.engines.cpu.stereo.matching import matching_cost_fast
+from pipelines.nerf.engines.cpu.stereo.neighbours import pair_scores_fast
 from pipelines.nerf.stereo.aggregation import aggregate, jump_weights
 from pipelines.nerf.stereo.agreement import AGREE, HIDDEN, IN_PICTURE, SEE_THROUGH, count_votes
 from pipelines.nerf.stereo.matching import matching_cost, plane_homographies
+from pipelines.nerf.stereo.neighbours import pair_scores
 from tests.unit.pipelines.nerf.stereo.painted_wall import look, row_of_cameras
 
 
@@ -79,3 +81,21 @@ def test_votes_equal_their_plain_twin() -> None:
     told = votes[[AGREE, SEE_THROUGH, HIDDEN]].sum(axis=0)
     assert (told <= votes[IN_PICTURE]).all()
     assert (told < votes[IN_PICTURE]).any(), "in a picture that knows nothing there"
+
+
+def test_scores_of_pairs_equal_their_plain_twin() -> None:
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(200, 3))
+    centers = 4.0 * rng.normal(size=(9, 3))
+    centers[1] = centers[0]  # seen from one place: an angle of 0
+    toward = points[None] - centers[:, None]
+    toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+    shown, facing = rng.random((9, 200)) < 0.6, rng.random((9, 9)) < 0.7
+    facing[0, 1] = True
+    shown[3] = False
+    given = toward, shown, facing, 8.0, (2.0, 10.0)
+    plain, fast = pair_scores(*given), pair_scores_fast(*given)
+    np.testing.assert_allclose(fast, plain, rtol=1e-6, atol=1e-9)
+    assert (plain > 0.0).sum() > 20
+    assert not plain[3].any()
+    assert not plain.diagonal().any()

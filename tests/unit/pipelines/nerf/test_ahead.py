@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from pipelines.scene.ahead import ahead
+from pipelines.nerf.ahead import ahead
 
 on_threads = pytest.mark.parametrize("threads", [1, 3])
 

@@ -7,8 +7,21 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
+import torch
+
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+_MOST_THREADS = 8
+"""Each holds what its item takes."""
+
+
+def each_ahead(
+    work: Callable[[_Item], _Result], items: Iterable[_Item]
+) -> Generator[_Result, None, None]:
+    """`ahead`, on as many threads as torch has, or 8."""
+    return ahead(work, items, min(torch.get_num_threads(), _MOST_THREADS))
 
 
 def ahead(
