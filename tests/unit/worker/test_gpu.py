@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from storage.settings import StorageSettings
 from worker.__main__ import main
@@ -181,6 +182,12 @@ def test_a_pytorch_that_cannot_compute_on_the_gpu_is_named(
         "This machine's GPU is not used: PyTorch 2.13.0 cannot compute on it: "
         "no kernel image is available"
     ]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_contained_process_computes_on_this_machines_gpu(tmp_path: Path) -> None:
+    assert is_found(tmp_path)
 
 
 def test_a_worker_for_the_gpu_alone_does_not_start_without_one(
