@@ -48,21 +48,23 @@ def detect_gpu() -> bool:
 def trial_problem(plan: Plan) -> str | None:
     """Why a process with this plan cannot compute on the GPU, in a line; None where it can."""
     command = ["-m", "worker.containment", "--plan", plan.to_json(), "worker.gpu_trial"]
+    trial = subprocess.Popen(
+        [sys.executable, *command],
+        env=dict(plan.environment),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
-        tried = subprocess.run(
-            [sys.executable, *command],
-            env=dict(plan.environment),
-            capture_output=True,
-            text=True,
-            timeout=_TRIAL_S,
-            check=False,
-        )
+        said, errors = trial.communicate(timeout=_TRIAL_S)
     except subprocess.TimeoutExpired:
+        trial.kill()  # not waited for: a process that hangs in the driver does not end even so
         return f"it did not answer within {_TRIAL_S:.0f} s"
-    if tried.returncode == 0:
+    if trial.returncode == 0:
         return None
-    lines = (tried.stdout.strip() or tried.stderr.strip()).splitlines()
-    return lines[-1] if lines else f"a process that tried it ended with status {tried.returncode}"
+    lines = (said.strip() or errors.strip()).splitlines()
+    return lines[-1] if lines else f"a process that tried it ended with status {trial.returncode}"
 
 
 def find_gpu(storage: StorageSettings, settings: WorkerSettings) -> bool:
@@ -70,16 +72,17 @@ def find_gpu(storage: StorageSettings, settings: WorkerSettings) -> bool:
     they cannot."""
     if not detect_gpu():
         return False
-    for _ in range(2):
-        plan = make_plan(storage, settings, os.environ, has_gpu=True)
-        problem = trial_problem(plan)
-        if problem is None:
-            return True
-        # Outside, the driver also makes devices that were missing, which the next plan has.
-        outside = trial_problem(replace(plan, mode="off"))
-        if outside is not None:
-            _log.error("This machine's GPU is not used: %s", outside)
-            return False
+    plan = make_plan(storage, settings, os.environ, has_gpu=True)
+    if trial_problem(plan) is None:
+        return True
+    outside = trial_problem(replace(plan, mode="off"))
+    if outside is not None:
+        _log.error("This machine's GPU is not used: %s", outside)
+        return False
+    # Outside, the driver also made devices that were missing, which another plan has.
+    problem = trial_problem(make_plan(storage, settings, os.environ, has_gpu=True))
+    if problem is None:
+        return True
     _log.error(
         "This machine's GPU is not used, since it works for everybody but contained stages: %s. "
         "NERFWORKS_WORKER_CONTAIN=off runs stages uncontained, with the GPU.",

@@ -42,8 +42,8 @@ class ContainmentError(RuntimeError):
 
 _THREADS = Path("/proc/self/task")
 _held: list[int] = []
-"""Descriptors that stay open: a rule is for an inode, and the kernel makes another one for a folder
-of /proc that nobody holds."""
+"""Descriptors that stay open, so that the inode that a rule is for stays the folder's own: /proc
+makes its folders anew for whoever asks."""
 
 
 def _rules(plan: Plan) -> list[Rule]:

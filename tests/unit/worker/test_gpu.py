@@ -45,6 +45,7 @@ int cuInit(unsigned flags) {
     const char *mode = getenv("NVIDIA_STAND_IN"), *secret = getenv("NVIDIA_SECRET");
     char name[64];
     if (!strcmp(mode, "crashes")) abort();
+    if (!strcmp(mode, "hangs")) for (;;) pause();
     if (!strcmp(mode, "is too old")) return 803;
     if (!strcmp(mode, "needs what is closed")) return opens(secret, O_RDONLY) ? 0 : 304;
     if (!strcmp(mode, "wakes outside")) {
@@ -67,10 +68,6 @@ class ones:
         return self.count
 """
 
-pytestmark = [
-    pytest.mark.skipif(sys.platform != "linux", reason="Linux confines processes so"),
-    pytest.mark.skipif(COMPILER is None, reason="needs a C compiler, for a driver's stand-in"),
-]
 confined = pytest.mark.skipif(
     landlock.version() < landlock.OLDEST, reason="needs a kernel with Landlock"
 )
@@ -79,8 +76,9 @@ confined = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a libcuda.so.1."""
+    if sys.platform != "linux" or COMPILER is None:
+        pytest.skip("how a GPU is tried is NOT tested: no Linux, or no C compiler for a stand-in")
     folder = tmp_path_factory.mktemp("driver")
-    assert COMPILER is not None
     made = [COMPILER, "-shared", "-fPIC", "-x", "c", "-", "-o", str(folder / "libcuda.so.1")]
     subprocess.run(made, input=DRIVER, text=True, check=True)
     return folder
@@ -166,6 +164,18 @@ def test_a_driver_that_does_not_start_anywhere_leaves_the_worker_without_a_gpu(
     (said,) = caplog.messages
     assert reason in said
     assert "CONTAIN" not in said
+
+
+def test_a_driver_that_hangs_does_not_keep_the_worker_from_starting(
+    machine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("NVIDIA_STAND_IN", "hangs")
+    monkeypatch.setattr("worker.gpu._TRIAL_S", 3.0)
+    # What hangs in the kernel outlives its kill, so nobody may wait for its end.
+    monkeypatch.setattr(subprocess.Popen, "wait", lambda *_, **__: pytest.fail("it was waited for"))
+    with caplog.at_level(logging.ERROR):
+        assert not is_found(tmp_path)
+    assert caplog.messages == ["This machine's GPU is not used: it did not answer within 3 s"]
 
 
 def test_a_pytorch_that_cannot_compute_on_the_gpu_is_named(
