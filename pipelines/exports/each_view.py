@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
-from pipelines.nerf.ahead import ahead
-from pipelines.nerf.engines.cpu.parts.runtime import num_threads
+from pipelines.nerf.ahead import each_ahead
 
 _View = TypeVar("_View")
 _Answer = TypeVar("_Answer")
@@ -22,4 +21,4 @@ def each_view(
 
     Results are those of one thread. `ask` runs on several at a time, and may raise.
     """
-    return ahead(ask, views, min(num_threads(), _MOST_THREADS))
+    return each_ahead(ask, views, _MOST_THREADS)

@@ -13,15 +13,11 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
-_MOST_THREADS = 8
-"""Each holds what its item takes."""
-
-
 def each_ahead(
-    work: Callable[[_Item], _Result], items: Iterable[_Item]
+    work: Callable[[_Item], _Result], items: Iterable[_Item], most_threads: int = 8
 ) -> Generator[_Result, None, None]:
-    """`ahead`, on as many threads as torch has, or 8."""
-    return ahead(work, items, min(torch.get_num_threads(), _MOST_THREADS))
+    """`ahead`, on as many threads as torch has, or so many: each holds what its item takes."""
+    return ahead(work, items, min(torch.get_num_threads(), most_threads))
 
 
 def ahead(

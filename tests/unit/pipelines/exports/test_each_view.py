@@ -10,11 +10,11 @@ import pytest
 from pipelines.exports.each_view import each_view
 
 
-@pytest.mark.parametrize(("of_kernels", "used"), [(1, 1), (2, 2), (9, 4)])
-def test_as_many_threads_as_kernels_have_or_a_few(
-    of_kernels: int, used: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("of_torch", "used"), [(1, 1), (2, 2), (9, 4)])
+def test_as_many_threads_as_torch_has_or_a_few(
+    of_torch: int, used: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.exports.each_view.num_threads", lambda: of_kernels)
+    monkeypatch.setattr("torch.get_num_threads", lambda: of_torch)
     names: set[str] = set()
 
     def named(view: int) -> int:
