@@ -80,7 +80,12 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                         },
                         "data": {"long_side_px": 480},
                         # docs/speed.md, "The preview's rate", has the measurements.
-                        "optimizer": {"lr": 0.015, "decay_steps": 1500, "lr_final": 1e-3},
+                        "optimizer": {
+                            "lr": 0.015,
+                            "lr_final": 1e-5,
+                            "decay": "linear",
+                            "decay_steps": 0,
+                        },
                     },
                     "pointcloud": {"num_points": 200_000},
                     "mesh": {"render_long_side_px": 240},
@@ -105,7 +110,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                             "camera_mode": "off",
                         },
                         "data": {"long_side_px": 800},
-                        "optimizer": {"lr": 0.01, "decay_steps": 6000, "lr_final": 3e-4},
+                        "optimizer": {"lr": 0.01, "decay_steps": 0, "lr_final": 3e-4},
                     },
                     "pointcloud": {"num_points": 500_000},
                     "mesh": {

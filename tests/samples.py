@@ -21,7 +21,6 @@ SMALL: dict[str, Any] = {
         "data": {"long_side_px": 240},
         "checkpoint_seconds": 5.0,
         "model": {"grid": {"log2_table_size": 15, "max_res": 256}},
-        "optimizer": {"decay_steps": 400},
     },
     "pointcloud": {"num_points": 20_000},
     "mesh": {"resolution": 96, "num_views": 30, "render_long_side_px": 160},

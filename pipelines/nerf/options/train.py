@@ -140,11 +140,18 @@ class FlatLossConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam and its exponential decay; rates as nerfstudio 1.1.5."""
+    """Adam and the decay of its rates; rates as nerfstudio 1.1.5."""
 
     lr: float = option(1e-2, "Rate of fields and proposals at the start.", ge=1e-7, le=1.0)
     lr_final: float = option(1e-4, "Rate at the end of the decay.", ge=1e-9, le=1.0)
-    decay_steps: int = option(200_000, "Length of the decay.", unit="steps", ge=1, le=10**8)
+    decay_steps: int = option(
+        200_000, "Length of the decay; 0 for the whole run.", unit="steps", ge=0, le=10**8
+    )
+    decay: str = option(
+        "exponential",
+        "How the rate of fields and proposals falls: by one factor, or by one amount, a step.",
+        choices=("exponential", "linear"),
+    )
     camera_lr: float = option(1e-3, "Rate of the cameras at the start.", ge=1e-8, le=1.0)
     camera_lr_final: float = option(1e-4, "Rate of the cameras at the end.", ge=1e-9, le=1.0)
     camera_decay_steps: int = option(5000, "Length of their decay.", unit="steps", ge=1, le=10**8)

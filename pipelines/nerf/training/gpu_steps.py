@@ -102,7 +102,7 @@ class GpuSteps:
             self._step, self._shape = self._start(shape), shape
         if self._kept is None or state.step - self._kept["step"] >= KEPT_EVERY:
             self._keep()
-        self._step.run(state.step, learning_rates(config.optimizer, state.step))
+        self._step.run(state.step, learning_rates(config, state.step))
         state.step += 1
         if not check:
             return None

@@ -214,7 +214,7 @@ def optimise_once(
     """
     model = state.model
     device = cameras.focal.device
-    rates = learning_rates(config.optimizer, state.step)
+    rates = learning_rates(config, state.step)
     for name, optimizer in state.optimizers.items():
         for group in optimizer.param_groups:
             group["lr"] = rates[name]

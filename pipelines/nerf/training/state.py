@@ -17,7 +17,7 @@ from torch import nn
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.options.catalogue import find_method
-from pipelines.nerf.options.train import OptimizerConfig, TrainConfig
+from pipelines.nerf.options.train import TrainConfig
 
 IMAGE_SHARE = 0.5
 """Of a GPU's free memory, for the images."""
@@ -26,16 +26,25 @@ MakeAdam = Callable[..., torch.optim.Adam]
 """Called with parameters, `lr` and `eps`."""
 
 
-def learning_rate(step: int, initial: float, final: float, decay_steps: int) -> float:
-    """exp((1 - t) ln initial + t ln final), t = step / decay_steps in [0, 1]."""
+def learning_rate(
+    step: int, initial: float, final: float, decay_steps: int, decay: str = "exponential"
+) -> float:
+    """exp((1 - t) ln initial + t ln final), t = step / decay_steps in [0, 1].
+
+    linear: (1 - t) initial + t final.
+    """
     t = min(step / decay_steps, 1.0)
+    if decay == "linear":
+        return (1.0 - t) * initial + t * final
     return math.exp((1.0 - t) * math.log(initial) + t * math.log(final))
 
 
-def learning_rates(rates: OptimizerConfig, step: int) -> dict[str, float]:
+def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
     """The rate of each optimiser, by its name."""
+    rates = config.optimizer
+    decay_steps = rates.decay_steps or config.max_steps
     return {
-        "networks": learning_rate(step, rates.lr, rates.lr_final, rates.decay_steps),
+        "networks": learning_rate(step, rates.lr, rates.lr_final, decay_steps, rates.decay),
         "cameras": learning_rate(
             step, rates.camera_lr, rates.camera_lr_final, rates.camera_decay_steps
         ),

@@ -6,12 +6,15 @@ from typing import Any
 
 import pytest
 
+from pipelines.nerf.training.state import learning_rates
 from pipelines.options import (
     ON_REQUEST,
     STAGE_OPTIONS,
     OptionsError,
     resolve_options,
+    stage_options,
     stages_skipped,
+    train_config,
 )
 from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, STAGES, skipped_stages
@@ -95,3 +98,16 @@ def test_a_surface_of_the_density_is_somewhere_within_it(wrong: dict[str, Any]) 
     assert resolve_options("preview", {"mesh": given})["mesh"]["density_level"] == 0.9
     with pytest.raises(OptionsError, match=f"mesh.{next(iter(wrong))}"):
         resolve_options("preview", {"mesh": wrong})
+
+
+@pytest.mark.parametrize("max_steps", [300, 1500, 3000])
+def test_previews_rate_falls_to_nothing_at_the_runs_end_however_long_that_is(
+    max_steps: int,
+) -> None:
+    resolved = resolve_options("preview", {"train": {"max_steps": max_steps}})
+    config = train_config(stage_options("train", resolved["train"]))
+    first, middle, last = (
+        learning_rates(config, step)["networks"] for step in (0, max_steps // 2, max_steps)
+    )
+    assert last < 1e-3 * first
+    assert 0.4 * first < middle < 0.6 * first

@@ -17,7 +17,7 @@ from pipelines.nerf.judging.metrics import psnr
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig, TensorGridConfig
-from pipelines.nerf.options.train import DataConfig, OptimizerConfig
+from pipelines.nerf.options.train import DataConfig, OptimizerConfig, TrainConfig
 from pipelines.nerf.renderer import Renderer
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.nerf.training.checkpoint import load_checkpoint
@@ -28,7 +28,7 @@ from pipelines.nerf.training.loop import (
     optimise_once,
     train,
 )
-from pipelines.nerf.training.state import initial_state, learning_rate
+from pipelines.nerf.training.state import initial_state, learning_rate, learning_rates
 from tests.threads import torch_threads
 from tests.unit.pipelines.nerf.toy_scene import (
     RADIUS,
@@ -303,6 +303,27 @@ def test_learning_rate_decays_exponentially() -> None:
     assert math.isclose(learning_rate(0, 1e-2, 1e-4, 100), 1e-2)
     assert math.isclose(learning_rate(50, 1e-2, 1e-4, 100), 1e-3)
     assert math.isclose(learning_rate(500, 1e-2, 1e-4, 100), 1e-4)
+
+
+def test_learning_rate_decays_linearly_where_asked_and_cameras_as_they_do() -> None:
+    linear = TrainConfig(
+        optimizer=OptimizerConfig(lr=0.02, lr_final=0.01, decay_steps=100, decay="linear")
+    )
+    for step, rate in ((0, 0.02), (25, 0.0175), (100, 0.01), (500, 0.01)):
+        assert math.isclose(learning_rates(linear, step)["networks"], rate)
+    exponential = replace(linear, optimizer=replace(linear.optimizer, decay="exponential"))
+    for step in (0, 50, 5000):
+        both = [learning_rates(each, step)["cameras"] for each in (linear, exponential)]
+        assert both[0] == both[1]
+
+
+def test_a_decay_over_the_whole_run_ends_with_it() -> None:
+    for max_steps in (40, 4000):
+        config = TrainConfig(
+            max_steps=max_steps, optimizer=OptimizerConfig(lr=0.1, lr_final=0.001, decay_steps=0)
+        )
+        assert math.isclose(learning_rates(config, max_steps // 2)["networks"], 0.01)
+        assert math.isclose(learning_rates(config, max_steps)["networks"], 0.001)
 
 
 def test_images_and_cameras_must_fit(images: ImageData, cameras: Cameras) -> None:

@@ -27,24 +27,13 @@ from pipelines.nerf.models.base import Model, StepPlan
 from pipelines.nerf.options.catalogue import find_method
 from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
 from pipelines.nerf.training.loop import train
-from pipelines.nerf.training.state import learning_rate
+from pipelines.nerf.training.state import learning_rates
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
 CPU = torch.device("cpu")
 NERF = Path(nerf.__file__).parent
 SEED = 5
 STEPS = 14  # past the first ten, after which the proposals learn in some steps only
-
-
-def rates_at(config: TrainConfig, step: int) -> dict[str, float]:
-    """The rate of each optimiser."""
-    rates = config.optimizer
-    return {
-        "networks": learning_rate(step, rates.lr, rates.lr_final, rates.decay_steps),
-        "cameras": learning_rate(
-            step, rates.camera_lr, rates.camera_lr_final, rates.camera_decay_steps
-        ),
-    }
 
 
 def toy_step(config: TrainConfig) -> tuple[Model, TrainingStep]:
@@ -106,7 +95,7 @@ def test_steps_and_losses_are_those_of_the_training_loop(
     reader = LossReader(CPU)
     assert reader.take() is None
     for number in range(STEPS):
-        step.run(number, rates_at(config, number))
+        step.run(number, learning_rates(config, number))
         found = step.losses()
         assert found.step == number
         assert found.values == reported[number]
@@ -122,10 +111,10 @@ def test_losses_sent_to_the_reader_stay_those_of_their_step() -> None:
     config = rare_updates()
     _, step = toy_step(config)
     reader = LossReader(CPU)
-    step.run(0, rates_at(config, 0))
+    step.run(0, learning_rates(config, 0))
     first = step.losses()
     reader.send(step)
-    step.run(1, rates_at(config, 1))
+    step.run(1, learning_rates(config, 1))
     taken = reader.take()
     assert taken == first
     assert taken != step.losses()
