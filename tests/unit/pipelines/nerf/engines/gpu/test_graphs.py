@@ -29,8 +29,9 @@ from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.options.catalogue import find_method
 from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
+from pipelines.nerf.training.state import learning_rates
 from tests.unit.pipelines.nerf.engines.gpu.taped_graphs import TapedGraphs
-from tests.unit.pipelines.nerf.engines.gpu.test_step import SEED, rates_at
+from tests.unit.pipelines.nerf.engines.gpu.test_step import SEED
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
 FIRST_STEP, NUM_STEPS, ANNEALED_AT = 10, 22, 20
@@ -72,7 +73,7 @@ class Toy:
     def run(self, first: int = FIRST_STEP, num: int = NUM_STEPS) -> list[StepLosses]:
         told = []
         for number in range(first, first + num):
-            self.step.run(number, rates_at(self.config, number))
+            self.step.run(number, learning_rates(self.config, number))
             told.append(self.step.losses())
         return told
 
@@ -133,7 +134,7 @@ def test_the_annealing_goes_on_in_replays() -> None:
     first = FIRST_STEP + 2 * EAGER_STEPS
     exponents = []
     for number in range(first, first + 4):
-        frozen.step.run(number, rates_at(frozen.config, number))
+        frozen.step.run(number, learning_rates(frozen.config, number))
         exponents.append(float(frozen.step._exponent))
     assert frozen.graphs.replays == 4
     assert len(frozen.graphs.tapes) == 2
