@@ -145,7 +145,12 @@ class OptimizerConfig:
     lr: float = option(1e-2, "Rate of fields and proposals at the start.", ge=1e-7, le=1.0)
     lr_final: float = option(1e-4, "Rate at the end of the decay.", ge=1e-9, le=1.0)
     decay_steps: int = option(
-        200_000, "Length of the decay; 0 for the whole run.", unit="steps", ge=0, le=10**8
+        200_000,
+        "Length of the decay; 0 for `max_steps`. A run that ends earlier, by `max_seconds`, ends "
+        "at a higher rate.",
+        unit="steps",
+        ge=0,
+        le=10**8,
     )
     decay: str = option(
         "exponential",
