@@ -160,6 +160,13 @@ class OptimizerConfig:
     camera_lr: float = option(1e-3, "Rate of the cameras at the start.", ge=1e-8, le=1.0)
     camera_lr_final: float = option(1e-4, "Rate of the cameras at the end.", ge=1e-9, le=1.0)
     camera_decay_steps: int = option(5000, "Length of their decay.", unit="steps", ge=1, le=10**8)
+    table_decay: float = option(
+        0.0,
+        "Times an entry of a hash grid's table, added to its gradient: what few rays tell anything "
+        "falls back to nothing. Entries that never had a gradient stay.",
+        ge=0.0,
+        le=1.0,
+    )
     # Squares of smaller gradients vanish in float32: less would divide what is left of the gradient
     # by nothing at all.
     eps: float = option(1e-15, "Adam's epsilon.", ge=1e-18, le=1.0)

@@ -16,6 +16,7 @@ from torch import nn
 
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
+from pipelines.nerf.networks.decay import decay_gradients, set_table_decay
 from pipelines.nerf.options.catalogue import find_method
 from pipelines.nerf.options.train import TrainConfig
 
@@ -134,7 +135,9 @@ def is_fast(config: TrainConfig, device: torch.device) -> bool:
 
 
 def _plain_adam(parameters: Iterable[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
-    return torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
+    adam = torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
+    adam.register_step_pre_hook(decay_gradients)
+    return adam
 
 
 def pixel_device(config: TrainConfig, device: torch.device, image_bytes: int) -> torch.device:
@@ -188,6 +191,7 @@ def initial_state(
     for optimizer in optimizers.values():
         for group in optimizer.param_groups:
             group["betas"] = (group["betas"][0], rates.beta2)
+    set_table_decay(optimizers["networks"], model, rates.table_decay)
     return TrainingState(
         model=model,
         optimizers=optimizers,

@@ -31,6 +31,7 @@ from pipelines.nerf.engines.gpu.step import EAGER_STEPS, TrainingStep, capturabl
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.networks.decay import set_table_decay
 from pipelines.nerf.networks.encodings import HashGrid, hash_encode
 from pipelines.nerf.options.catalogue import find_method
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
@@ -305,6 +306,7 @@ def _start(config: TrainConfig, device: torch.device, setting: Setting, engine: 
     optimizers = {
         "networks": capturable_adam(model.network_parameters(), LEARNING_RATE, eps, device)
     }
+    set_table_decay(optimizers["networks"], model, config.optimizer.table_decay)
     if config.model.camera_mode != "off":
         corrections = model.cameras_delta.parameters()
         optimizers["cameras"] = capturable_adam(corrections, LEARNING_RATE, eps, device)

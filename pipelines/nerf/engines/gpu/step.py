@@ -38,6 +38,7 @@ from pipelines.nerf.data.pixels import Batch, PixelSampler
 from pipelines.nerf.engines.gpu.graphs import CudaGraphs, Recorder, Replay
 from pipelines.nerf.models.base import Model, StepPlan
 from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.networks.decay import decay_gradients
 from pipelines.nerf.space.cameras import Cameras
 
 EAGER_STEPS = 3
@@ -71,12 +72,14 @@ def capturable_adam(
     On a GPU one fused kernel reads each parameter, gradient and moment once. Elsewhere the same
     optimiser with a number for its rate.
     """
-    if device.type != "cuda":
-        return torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
-    held = torch.tensor(lr, dtype=torch.float32, device=device)
-    adam = torch.optim.Adam(parameters, lr=held, eps=eps, fused=True, capturable=True)
-    # torch would warn at each optimiser's first step, which is never captured.
-    adam._warned_capturable_if_run_uncaptured = True
+    if device.type == "cuda":
+        held = torch.tensor(lr, dtype=torch.float32, device=device)
+        adam = torch.optim.Adam(parameters, lr=held, eps=eps, fused=True, capturable=True)
+        # torch would warn at each optimiser's first step, which is never captured.
+        adam._warned_capturable_if_run_uncaptured = True
+    else:
+        adam = torch.optim.Adam(parameters, lr=lr, eps=eps, fused=True)
+    adam.register_step_pre_hook(decay_gradients)
     return adam
 
 

@@ -1,6 +1,7 @@
 """Adam in one pass over memory, which also zeroes the gradient for the next step.
 
-Twin of `torch.optim.Adam` without weight decay, with the same state, so that checkpoints fit both.
+Twin of `torch.optim.Adam` without weight decay, with the same state, so that checkpoints fit both,
+and of `networks.decay.decay_gradients`.
 A table's step is bound by memory: gradient, two moments and parameter are read and written once.
 Symbols: g gradient, m and v its first and second moment.
 """
@@ -23,21 +24,28 @@ from torch import Tensor, nn
 
 from pipelines.nerf.engines.cpu.parts.lanes import FLOATS, LANES, Lanes
 from pipelines.nerf.engines.cpu.parts.runtime import exact, run_threads
+from pipelines.nerf.networks.decay import DECAYS
 
 THREADED_SIZE = 2**16
 """Smaller parameters are done before threads would have started."""
 ZERO = np.float32(0.0)
-NUM_NUMBERS = 6
+NUM_NUMBERS = 7
 
 
-def _any(lanes: Lanes, *values: Any) -> Any:
-    """Whether a lane of any of the values is not 0; a NaN is not."""
+def _not_zero(lanes: Lanes, *values: Any) -> Any:
+    """The lanes in which any of the values is not 0; a NaN is not."""
     build = lanes.builder
     found = None
     for value in values:
         other = build.fcmp_unordered("!=", value, lanes.floats(0.0))
         found = other if found is None else build.or_(found, other)
-    bits = build.bitcast(found, ir.IntType(LANES))
+    return found
+
+
+def _any(lanes: Lanes, *values: Any) -> Any:
+    """Whether a lane of any of the values is not 0."""
+    build = lanes.builder
+    bits = build.bitcast(_not_zero(lanes, *values), ir.IntType(LANES))
     return build.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
@@ -47,13 +55,16 @@ def _generate_update(context: Any, builder: Any, signature: Any, arguments: Any)
     p, g, m, v = (lanes.load(address) for address in addresses)
     has_gradient = _any(lanes, g)
     with builder.if_then(builder.or_(has_gradient, _any(lanes, m, v))):
-        gain, decay, gain_square, step_size, root, eps = (
+        gain, keep, gain_square, step_size, root, eps, decay = (
             lanes.splat(lanes.load(lanes.at(numbers, 4 * i), ir.FloatType()))
             for i in range(NUM_NUMBERS)
         )
+        own = builder.fmul(decay, p)
+        own = builder.select(_not_zero(lanes, g, m, v), own, lanes.floats(0.0))
+        g = builder.fadd(g, own)
         first = builder.fadd(m, builder.fmul(gain, builder.fsub(g, m)))
         square = builder.fmul(gain_square, builder.fmul(g, g))
-        second = builder.fadd(builder.fmul(decay, v), square)
+        second = builder.fadd(builder.fmul(keep, v), square)
         kind = ir.FunctionType(FLOATS, [FLOATS])
         name = f"llvm.sqrt.v{LANES}f32"
         sqrt = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
@@ -83,8 +94,8 @@ def _update_lanes(typing_context, p, g, m, v, numbers):
 def _update(share, shares, p, g, m, v, numbers):
     """One step of p, g, m, v [N] float32; g is 0 afterwards.
 
-    numbers: 1 - beta1, beta2, 1 - beta2, lr / (1 - beta1^t), sqrt(1 - beta2^t), eps. Where g, m and
-    v are 0 nothing is written, and g not where it is 0 already.
+    numbers: 1 - beta1, beta2, 1 - beta2, lr / (1 - beta1^t), sqrt(1 - beta2^t), eps, and what part
+    of p is added to g. Where g, m and v are 0 p stays, and g is not written where it is 0 already.
     """
     p_at, g_at = np.intp(p.ctypes.data), np.intp(g.ctypes.data)
     m_at, v_at = np.intp(m.ctypes.data), np.intp(v.ctypes.data)
@@ -94,10 +105,13 @@ def _update(share, shares, p, g, m, v, numbers):
         at = block * LANES * 4
         _update_lanes(p_at + at, g_at + at, m_at + at, v_at + at, numbers_at)  # type: ignore[call-arg]
     if share == shares - 1:
-        gain, decay, gain_square, step_size, root, eps = numbers
+        gain, keep, gain_square, step_size, root, eps, decay = numbers
         for i in range(blocks * LANES, len(p)):
-            first = m[i] + gain * (g[i] - m[i])
-            second = decay * v[i] + gain_square * (g[i] * g[i])
+            slope = g[i]
+            if slope != ZERO or m[i] != ZERO or v[i] != ZERO:
+                slope += decay * p[i]
+            first = m[i] + gain * (slope - m[i])
+            second = keep * v[i] + gain_square * (slope * slope)
             m[i], v[i], g[i] = first, second, ZERO
             if first != ZERO:  # as above
                 p[i] -= step_size * first / (np.float32(math.sqrt(second)) / root + eps)
@@ -154,12 +168,13 @@ class FusedAdam(torch.optim.Adam):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
-            for parameter in group["params"]:
+            decays = group.get(DECAYS) or (0.0,) * len(group["params"])
+            for parameter, decay in zip(group["params"], decays, strict=True):
                 if parameter.grad is not None and not self._is_zeroed(parameter):
-                    self._update(parameter, group)
+                    self._update(parameter, group, decay)
         return loss
 
-    def _update(self, parameter: Tensor, group: dict[str, Any]) -> None:
+    def _update(self, parameter: Tensor, group: dict[str, Any], decay: float) -> None:
         state = self.state[parameter]
         if not state:
             state["step"] = torch.tensor(0.0)
@@ -179,6 +194,7 @@ class FusedAdam(torch.optim.Adam):
             float(group["lr"]) / (1.0 - beta1**steps),
             math.sqrt(1.0 - beta2**steps),
             group["eps"],
+            decay,
         )
         flat = (tensor.detach().view(-1).numpy() for tensor in tensors)
         arguments = (*flat, np.array(numbers, np.float32))

@@ -27,8 +27,9 @@ from pipelines.nerf.engines.gpu.step import (
 )
 from pipelines.nerf.models.base import Model
 from pipelines.nerf.models.nerfacto import Nerfacto
+from pipelines.nerf.networks.decay import decay_gradients, set_table_decay
 from pipelines.nerf.options.catalogue import find_method
-from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
+from pipelines.nerf.options.train import FlatLossConfig, OptimizerConfig, TrainConfig
 from pipelines.nerf.training.state import learning_rates
 from tests.unit.pipelines.nerf.engines.gpu.taped_graphs import TapedGraphs
 from tests.unit.pipelines.nerf.engines.gpu.test_step import SEED
@@ -48,7 +49,11 @@ def one_thread() -> Iterator[None]:
 
 def config_of_all_kinds() -> TrainConfig:
     """The proposals learn in every second step, and the annealing ends in the middle of the run."""
-    config = tiny_config(rays_per_step=32, flat=FlatLossConfig("always", contrast=1.0))
+    config = tiny_config(
+        rays_per_step=32,
+        flat=FlatLossConfig("always", contrast=1.0),
+        optimizer=OptimizerConfig(decay_steps=1000, table_decay=1e-3),
+    )
     return with_model(
         config, proposal_warmup_steps=1, proposal_update_every=2, anneal_steps=ANNEALED_AT
     )
@@ -57,7 +62,9 @@ def config_of_all_kinds() -> TrainConfig:
 def adam(parameters: Any) -> torch.optim.Adam:
     """As on a GPU: the rate is a tensor."""
     rate = torch.tensor(0.0, dtype=torch.float32)
-    return torch.optim.Adam(parameters, lr=rate, eps=1e-15, fused=True)
+    made = torch.optim.Adam(parameters, lr=rate, eps=1e-15, fused=True)
+    made.register_step_pre_hook(decay_gradients)
+    return made
 
 
 @dataclass
@@ -106,6 +113,7 @@ def toy(
         capture=graphs if taped else False,
         **given,
     )
+    set_table_decay(step.optimizers["networks"], model, config.optimizer.table_decay)
     return Toy(model, step, graphs, pixel_random, config)
 
 

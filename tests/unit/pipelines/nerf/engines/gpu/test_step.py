@@ -24,8 +24,9 @@ from pipelines.nerf.engines.gpu.step import (
     loss_scaler,
 )
 from pipelines.nerf.models.base import Model, StepPlan
+from pipelines.nerf.networks.decay import set_table_decay
 from pipelines.nerf.options.catalogue import find_method
-from pipelines.nerf.options.train import FlatLossConfig, TrainConfig
+from pipelines.nerf.options.train import FlatLossConfig, OptimizerConfig, TrainConfig
 from pipelines.nerf.training.loop import train
 from pipelines.nerf.training.state import learning_rates
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
@@ -59,13 +60,15 @@ def toy_step(config: TrainConfig) -> tuple[Model, TrainingStep]:
         pixel_random=torch.Generator().manual_seed(SEED),
         model_random=torch.Generator().manual_seed(SEED + 1),
     )
+    set_table_decay(step.optimizers["networks"], model, rates.table_decay)
     return model, step
 
 
 def rare_updates(**changes: object) -> TrainConfig:
     """A run in which both kinds of steps occur, before and after the end of the annealing."""
     flat = FlatLossConfig("always", contrast=1.0)
-    config = tiny_config(rays_per_step=64, max_steps=STEPS, flat=flat, **changes)
+    rates = OptimizerConfig(decay_steps=1000, table_decay=1e-3)
+    config = tiny_config(rays_per_step=64, max_steps=STEPS, flat=flat, optimizer=rates, **changes)
     return with_model(config, proposal_warmup_steps=1, proposal_update_every=3, anneal_steps=12)
 
 

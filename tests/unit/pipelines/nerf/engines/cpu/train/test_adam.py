@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from pipelines.nerf.engines.cpu.train.adam import THREADED_SIZE, FusedAdam
+from pipelines.nerf.networks.decay import DECAYS, decay_gradients
 
 RATE, EPS = 1e-2, 1e-15
 
@@ -32,13 +33,18 @@ def sparse_gradient(shape: tuple[int, ...], step: int) -> torch.Tensor:
     return gradient * rows.reshape(-1, *[1] * (len(shape) - 1))
 
 
+@pytest.mark.parametrize("decay", [0.0, 1e-2])
 @pytest.mark.parametrize("shape", [(THREADED_SIZE, 2), (1003, 2), (7,), (16, 10)])
-def test_equals_torch_over_a_hundred_steps(shape: tuple[int, ...], threads: int) -> None:
+def test_equals_torch_over_a_hundred_steps(
+    shape: tuple[int, ...], decay: float, threads: int
+) -> None:
     torch.manual_seed(0)
     ours = nn.Parameter(torch.randn(shape) * 1e-3)
+    start = ours.detach().clone()
     theirs = nn.Parameter(ours.detach().double())
     fused = FusedAdam([ours], lr=RATE, eps=EPS)
     truth = torch.optim.Adam([theirs], lr=RATE, eps=EPS)
+    truth.register_step_pre_hook(decay_gradients)
     ours.grad = torch.zeros(shape)
     for step in range(100):
         gradient = sparse_gradient(shape, step)
@@ -46,7 +52,10 @@ def test_equals_torch_over_a_hundred_steps(shape: tuple[int, ...], threads: int)
         theirs.grad = gradient.double()
         for optimizer in (fused, truth):
             optimizer.param_groups[0]["lr"] = RATE * 0.99**step
+            optimizer.param_groups[0][DECAYS] = (decay,)
             optimizer.step()
+    quiet = slice(shape[0] - shape[0] // 4, None)
+    assert torch.equal(ours[quiet], start[quiet])
     # A hundred steps of at most 0.01 each, with a few rounding errors of float32 in each.
     assert theirs.detach().abs().max() > 0.1 or shape == (7,)
     assert (ours - theirs).abs().max() < 100 * RATE * 1e-6
@@ -65,6 +74,23 @@ def test_momentum_moves_entries_on_that_have_no_gradient() -> None:
         expected -= RATE * (m / (1 - 0.9**step)) / (v / (1 - 0.999**step)) ** 0.5
     assert parameter[3].item() == pytest.approx(expected, rel=1e-5)
     assert parameter.detach().count_nonzero() == 1
+
+
+def test_each_parameter_decays_by_its_own_number() -> None:
+    """One step of g + d p, of which Adam's first step takes the sign."""
+    kept, decayed = (nn.Parameter(torch.full((40,), 0.5)) for _ in range(2))
+    optimizer = FusedAdam([kept, decayed], lr=RATE, eps=EPS)
+    optimizer.param_groups[0][DECAYS] = (0.0, 0.1)
+    for parameter in (kept, decayed):
+        parameter.grad = torch.zeros(40)
+        parameter.grad[[3, 39]] = -0.01
+    optimizer.step()
+    expected = torch.full((40,), 0.5)
+    expected[[3, 39]] = 0.5 + RATE
+    torch.testing.assert_close(kept.detach(), expected)
+    expected[[3, 39]] = 0.5 - RATE
+    torch.testing.assert_close(decayed.detach(), expected)
+    assert optimizer.state[decayed]["exp_avg"][3].item() == pytest.approx(0.1 * 0.04)
 
 
 @pytest.mark.parametrize("eps", [EPS, 0.0])
