@@ -85,6 +85,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                             "lr_final": 1e-5,
                             "decay": "linear",
                             "decay_steps": 0,
+                            "table_decay": 3e-8,
                         },
                     },
                     "pointcloud": {"num_points": 200_000},

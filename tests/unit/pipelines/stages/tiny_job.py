@@ -39,7 +39,12 @@ OPTIONS: dict[str, Any] = {
         },
         "data": {"long_side_px": LONG_SIDE},
         # A rate that is still high at the end: these few steps are cut off from a longer run.
-        "optimizer": {"decay": "exponential", "decay_steps": 1500, "lr_final": 1e-3},
+        "optimizer": {
+            "decay": "exponential",
+            "decay_steps": 1500,
+            "lr_final": 1e-3,
+            "table_decay": 0.0,
+        },
     },
     "mesh": {"resolution": 64, "num_views": 12, "render_long_side_px": 64, "max_faces": 3000},
     "pointcloud": {"num_points": 4000},
