@@ -45,7 +45,7 @@ class PairStatistics:
     partner. num_pairs: pairs compared. num_verified: pairs with a verified geometry.
     homographies: [H, 3, 3], of the verified pairs that one homography explains (a turning camera,
     or one plane), in units of the image's long side from its centre, x right, y down.
-    verified: [V, 3] int, of each verified pair both images and its matches.
+    verified: [V, 3] int, of each verified pair both images, the lower first, and its matches.
     """
 
     num_features: npt.NDArray[np.int64]
@@ -144,7 +144,7 @@ def read_statistics(database: Path, num_images: int) -> PairStatistics:
         for index, _, _ in (first, second):
             best[index] = max(best[index], rows)
         if rows > 0:
-            verified.append((first[0], second[0], rows))
+            verified.append((*sorted((first[0], second[0])), rows))
         if rows > 0 and config in _ONE_HOMOGRAPHY and blob:
             pixels = np.frombuffer(blob, np.float64).reshape(3, 3)
             homographies.append(
@@ -156,7 +156,7 @@ def read_statistics(database: Path, num_images: int) -> PairStatistics:
         num_pairs=len(pairs),
         num_verified=len(verified),
         homographies=np.array(homographies, np.float64).reshape(-1, 3, 3),
-        verified=np.array(verified, np.int64).reshape(-1, 3),
+        verified=np.array(sorted(verified), np.int64).reshape(-1, 3),
     )
 
 
@@ -180,7 +180,8 @@ def read_features(database: Path, num_images: int, per_image: int) -> list[npt.N
 def read_matches(
     database: Path, num_images: int, most_pairs: int | None = None, most_matches: int | None = None
 ) -> VerifiedMatches:
-    """Verified matches of pairs of indices: places in pixels in the one and the other, [M, 2] each.
+    """Verified matches of pairs of indices, the lower first: places in pixels in the one and the
+    other, [M, 2] each.
 
     most_pairs, most_matches: of each pair, evenly picked where there are more.
 
@@ -198,10 +199,23 @@ def read_matches(
         ):
             if number not in kept:
                 continue
-            i, j = (index_of[image] for image in pycolmap.pair_id_to_image_pair(pair_id))
-            matches = np.frombuffer(blob, np.uint32).reshape(rows, 2)[_evenly(rows, most_matches)]
+            i, j, matches = _in_order(index_of, pair_id, blob)
+            matches = matches[_evenly(rows, most_matches)]
             found[i, j] = places[i][matches[:, 0]], places[j][matches[:, 1]]
     return found
+
+
+def _in_order(
+    index_of: dict[int, int], pair_id: int, blob: bytes
+) -> tuple[int, int, npt.NDArray[np.int64]]:
+    """A pair's indices, the lower first, and its matches [M, 2] in that order.
+
+    COLMAP orders a pair by its images' ids, which they get as their features are found: by several
+    threads, so now and then in another order than that of their names.
+    """
+    i, j = (index_of[image] for image in pycolmap.pair_id_to_image_pair(pair_id))
+    matches = np.frombuffer(blob, np.uint32).reshape(-1, 2).astype(np.int64)
+    return (i, j, matches) if i < j else (j, i, matches[:, ::-1])
 
 
 def _features(
@@ -226,7 +240,7 @@ class Correspondences:
     """Which features of which images show the same, N images.
 
     places: of each image [F, 2], where its features are, in pixels. matches: by pairs of indices,
-    [M, 2], rows of `places` in the one and the other.
+    the lower first, [M, 2], rows of `places` in the one and the other.
     """
 
     places: tuple[npt.NDArray[np.float64], ...]
@@ -238,11 +252,11 @@ def read_correspondences(database: Path, num_images: int) -> Correspondences:
     found = {}
     with contextlib.closing(sqlite3.connect(database)) as connection:
         index_of, places = _features(connection, num_images)
-        for pair_id, rows, blob in connection.execute(
-            "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0"
+        for pair_id, blob in connection.execute(
+            "SELECT pair_id, data FROM two_view_geometries WHERE rows > 0"
         ):
-            i, j = (index_of[image] for image in pycolmap.pair_id_to_image_pair(pair_id))
-            found[i, j] = np.frombuffer(blob, np.uint32).reshape(rows, 2).astype(np.int64)
+            i, j, matches = _in_order(index_of, pair_id, blob)
+            found[i, j] = matches
     return Correspondences(tuple(places), found)
 
 

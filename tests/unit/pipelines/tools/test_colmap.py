@@ -77,6 +77,36 @@ def test_features_are_read_evenly_and_no_more_than_wanted(tmp_path: Path) -> Non
     np.testing.assert_array_equal(some[1][-1], whole[1][-1])
 
 
+def test_pairs_are_in_the_images_order_whatever_ids_colmap_gave_them(tmp_path: Path) -> None:
+    """COLMAP numbers images as their features are found, by several threads."""
+    found = {}
+    for name, order in (("ordered", (0, 1, 2)), ("turned", (2, 1, 0))):
+        (tmp_path / name).mkdir()
+        reconstructor = Reconstructor(
+            tmp_path / f"{name}.db", three_pictures(tmp_path / name), tmp_path / name / "scratch"
+        )
+        for index in order:
+            reconstructor.extract((CameraGroup((index,), "SIMPLE_RADIAL"),), COARSE, nothing)
+        with pycolmap.Database.open(tmp_path / f"{name}.db") as opened:
+            first = opened.read_image_with_name(reconstructor.names[0])
+            assert (first.image_id == 1) == (name == "ordered")
+        pairs = [(0, 1), (1, 2)]
+        reconstructor.match(pairs, nothing)
+        verified = reconstructor.statistics().verified
+        assert [(int(i), int(j)) for i, j, _ in verified] == pairs
+        matches = reconstructor.verified_of(pairs)
+        assert list(map(tuple, sorted(matches))) == pairs
+        found[name] = [np.median(matches[pair][1] - matches[pair][0], axis=0) for pair in pairs]
+        linked = reconstructor.correspondences()
+        for i, j in pairs:
+            rows = linked.matches[i, j]
+            for side, index in enumerate((i, j)):
+                places = linked.places[index][rows[:, side]]
+                np.testing.assert_array_equal(places, matches[i, j][side])
+    assert np.abs(found["ordered"]).max() > 5.0
+    np.testing.assert_allclose(found["ordered"], found["turned"], atol=2.0)
+
+
 def test_mapping_starts_from_a_focal_length_where_none_is_known(tmp_path: Path) -> None:
     reconstructor = Reconstructor(tmp_path / "colmap.db", three_pictures(tmp_path), tmp_path / "s")
     known = CameraGroup((0,), "PINHOLE", 300.0)
