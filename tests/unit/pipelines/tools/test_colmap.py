@@ -89,6 +89,7 @@ def test_pairs_are_in_the_images_order_whatever_ids_colmap_gave_them(tmp_path: P
             reconstructor.extract((CameraGroup((index,), "SIMPLE_RADIAL"),), COARSE, nothing)
         with pycolmap.Database.open(tmp_path / f"{name}.db") as opened:
             first = opened.read_image_with_name(reconstructor.names[0])
+            assert first is not None
             assert (first.image_id == 1) == (name == "ordered")
         pairs = [(0, 1), (1, 2)]
         reconstructor.match(pairs, nothing)
