@@ -205,7 +205,21 @@ class Reconstructor:
     def _extract_portion(
         self, names: list[str], reader: Any, options: Any, cameras: Any, watch: Watch, done: int
     ) -> None:
-        """Features of a few images. cameras: whether they share the reader's camera."""
+        """Features of a few images. cameras: whether they share the reader's camera.
+
+        They are put into the database first, one after another: what COLMAP's threads are done with
+        first would else be numbered first, and verified as the first of a pair, so that two runs
+        would not agree.
+        """
+        if not self.database.exists():
+            pycolmap.Database.open(self.database).close()
+        self._run(
+            "reading images",
+            lambda _token: pycolmap.import_images(
+                self.database, self.links, camera_mode=cameras, image_names=names, options=reader
+            ),
+            lambda: watch(done),
+        )
         self._run(
             "finding features",
             lambda token: pycolmap.extract_features(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from pipelines.tools.colmap import (
     CameraGroup,
@@ -75,6 +77,26 @@ def test_features_are_read_evenly_and_no_more_than_wanted(tmp_path: Path) -> Non
     assert [part.shape for part in some] == [(20, 128)] * 3
     np.testing.assert_array_equal(some[1][0], whole[1][0])
     np.testing.assert_array_equal(some[1][-1], whole[1][-1])
+
+
+def test_images_are_numbered_in_their_order(tmp_path: Path) -> None:
+    """Not in that in which threads are done with them: the first ones here take longest."""
+    paths = [tmp_path / f"{i}.png" for i in range(6)]
+    for i, (path, pose) in enumerate(zip(paths, arc_poses(6), strict=True)):
+        picture = render(pose)
+        if i % 3:
+            Image.new("RGB", picture.size, "gray").save(path)
+        else:
+            picture.save(path)
+    reconstructor = Reconstructor(tmp_path / "colmap.db", paths, tmp_path / "s", num_threads=4)
+    fine = replace(FINE, num_threads=4)
+    reconstructor.extract((CameraGroup(tuple(range(6)), "SIMPLE_RADIAL"),), fine, nothing)
+    with pycolmap.Database.open(tmp_path / "colmap.db") as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
+    assert [image.name for image in images] == reconstructor.names
+    counts = reconstructor.statistics().num_features
+    assert (counts[::3] > 100).all()
+    assert not counts[1::3].any()
 
 
 def test_pairs_are_in_the_images_order_whatever_ids_colmap_gave_them(tmp_path: Path) -> None:
