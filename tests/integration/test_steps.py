@@ -67,11 +67,15 @@ class Service:
             reap_expired(session, now(session) + LEASE_OVER)
 
     def finish(self, job: str, timeout_s: float = 200.0) -> Job:
-        """Have the other worker do what there is to do until the job is over."""
-        self.reap()
+        """Have the other worker do what there is to do until the job is over.
+
+        The reaper comes by more than once, as it does in life: PostgreSQL may hold a dead worker's
+        rows for a moment yet, and locked ones are left to the next time.
+        """
         deadline = time.monotonic() + timeout_s
         while (found := self.engine.job(job)).finished_at is None:
             assert time.monotonic() < deadline, f"the job is {found.state}"
+            self.reap()
             self.rescuer.serve()
             time.sleep(0.02)
         return found
