@@ -56,6 +56,8 @@ _METRICS = (
     "floaters_reason",
     "per_image",
 )
+_WARNING = ("poses", "train", "assess")
+"""Stages whose warnings have a code: those of a capture stand with it."""
 _LONG = ("images", "placed")
 """What a failed stage says of each picture: that is in the capture report, drawn."""
 _NOTHING_TRAINED: dict[str, Any] = {
@@ -112,7 +114,6 @@ def build_report(
 
     trains: whether training is among the job's stages; without it there is nothing to measure.
     """
-    assessed = manifests.get("assess", {}).get("summary", {})
     return {
         "version": REPORT_VERSION,
         "state": "succeeded",
@@ -129,8 +130,9 @@ def build_report(
         "check": check_of(manifests.get("check", {}).get("summary")),
         **(_quality(manifests) if trains else _NOTHING_TRAINED),
         "warnings": [
-            *manifests.get("poses", {}).get("summary", {}).get("warnings", []),
-            *assessed.get("warnings", []),
+            warning
+            for name in _WARNING
+            for warning in manifests.get(name, {}).get("summary", {}).get("warnings", [])
         ],
         "timings": {f"{name}_s": item["timings"]["wall_s"] for name, item in manifests.items()},
         "stages": {

@@ -88,6 +88,7 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
     capture, deltas = corrected_cameras(inputs.capture, inputs.train, model.cameras_delta, inputs)
     capture.save(ctx.out / "cameras.json")
     width, height = _typical_size(inputs.images)
+    device = next(model.parameters()).device
     extras = {
         "cameras": capture.as_dict(),
         "train": asdict(config),
@@ -102,7 +103,9 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         "num_test": len(inputs.test),
         "width": width,
         "height": height,
-        "device": next(model.parameters()).device.type,
+        "device": device.type,
+        "engine": model.engine,
+        "warnings": engine_warnings(config, device, model.engine),
         "plain_lines": config.flat.when == "always",
         "camera_deltas": deltas,
     }
@@ -117,6 +120,31 @@ def decided(config: TrainConfig, capture: CamerasFile) -> TrainConfig:
     around = told.why is None and told.measures["arc_deg"] >= _ALL_ROUND_DEG
     when = "always" if around else "never"
     return replace(config, flat=replace(config.flat, when=when))
+
+
+def engine_warnings(config: TrainConfig, device: torch.device, engine: str) -> list[dict[str, Any]]:
+    """What a person should know of how a GPU trained: {code, message, hint, details}.
+
+    engine: that trained. "auto" trains with PyTorch's own operations where ours do not work.
+    """
+    if device.type != "cuda" or config.engine != "auto" or engine == "fast":
+        return []
+    # Imported here: a machine without a GPU needs no Triton.
+    from pipelines.nerf.engines.gpu.self_check import engine_problem
+
+    problem = engine_problem(config, device)
+    if problem is None:
+        return []
+    return [
+        {
+            "code": "slow_engine",
+            "message": "The GPU trained some ten times slower than it can, since its compiled "
+            f"engine did not work: {problem}",
+            "hint": "The job's log of `train` says more, and the worker's log at its start. Most "
+            "often a C compiler or the headers of Python are missing, or closed to stages.",
+            "details": {"problem": problem},
+        }
+    ]
 
 
 def preload() -> None:

@@ -28,6 +28,7 @@ from worker.containment.environment import (
 )
 from worker.containment.limits import Limits, default_memory_bytes
 from worker.containment.plan import Plan
+from worker.containment.toolchain import compiler_folders
 from worker.settings import WorkerSettings
 
 _SYSTEM = (
@@ -179,6 +180,8 @@ def make_plan(
     opened += _split(settings.stage_readable)
     listed: list[Path] = []
     libraries = [*(Path(path) for path in _SYSTEM), *_libraries(environment)]
+    if has_gpu:  # Triton calls a C compiler
+        libraries += compiler_folders(given)
     for folder, hidden in (
         *((path, True) for path in libraries),
         *((path, False) for path in _code()),

@@ -2,7 +2,8 @@
 
 The stand-in is a library in C that starts as the driver does: it names a thread by writing to a
 file of it, and gives error 304 where it must not. In the place of PyTorch with CUDA, which has
-gigabytes, is a module that adds numbers up.
+gigabytes, is a module that adds numbers up; in that of Triton, one that calls the C compiler as
+Triton does, and runs what that made.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -22,7 +24,7 @@ from storage.settings import StorageSettings
 from worker.__main__ import main
 from worker.containment import landlock
 from worker.containment.planning import make_plan
-from worker.gpu import detect_gpu, find_gpu, trial_problem
+from worker.gpu import Trial, detect_gpu, find_gpu, try_gpu
 from worker.settings import WorkerSettings
 
 COMPILER = shutil.which("cc")
@@ -67,6 +69,25 @@ class ones:
     def sum(self):
         return self.count
 """
+TRITON = """
+import ctypes, os, shutil, subprocess, tempfile
+def cdiv(a, b):
+    return -(-a // b)
+def jit(kernel):
+    return Kernel()
+class Kernel:
+    def __getitem__(self, grid):
+        return self.launch
+    def launch(self, numbers, count, block):
+        compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
+        with tempfile.TemporaryDirectory() as made:
+            source, library = os.path.join(made, "launcher.c"), os.path.join(made, "launcher.so")
+            with open(source, "w") as file:
+                file.write("#include <stddef.h>\\nsize_t twice(size_t n) { return 2 * n; }")
+            command = [compiler, source, "-O3", "-shared", "-fPIC", "-o", library]
+            subprocess.check_call(command, stdout=subprocess.DEVNULL)
+            numbers.count = ctypes.CDLL(library).twice(numbers.count)
+"""
 
 confined = pytest.mark.skipif(
     landlock.version() < landlock.OLDEST, reason="needs a kernel with Landlock"
@@ -91,6 +112,9 @@ def machine(driver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     torch = tmp_path / "torch"
     torch.mkdir()
     (torch / "torch.py").write_text(TORCH)
+    (torch / "triton").mkdir()
+    (torch / "triton" / "__init__.py").write_text(TRITON)
+    (torch / "triton" / "language.py").write_text("constexpr = int")
     monkeypatch.setattr("worker.gpu.detect_gpu", lambda: True)
     monkeypatch.setenv("LD_LIBRARY_PATH", str(driver))
     monkeypatch.setenv("PYTHONPATH", str(torch))
@@ -120,8 +144,8 @@ def test_the_driver_starts_where_a_stage_may_name_its_threads_and_not_elsewhere(
 ) -> None:
     home = StorageSettings(home=tmp_path / "home")
     plan = make_plan(home, WorkerSettings(), os.environ, has_gpu=True)
-    assert trial_problem(plan) is None
-    problem = trial_problem(replace(plan, names_threads=False))
+    assert try_gpu(plan) == Trial()
+    problem = try_gpu(replace(plan, names_threads=False)).problem
     assert problem == "the driver does not start: CUDA error 304, OS call failed"
 
 
@@ -171,8 +195,14 @@ def test_a_driver_that_hangs_does_not_keep_the_worker_from_starting(
 ) -> None:
     monkeypatch.setenv("NVIDIA_STAND_IN", "hangs")
     monkeypatch.setattr("worker.gpu._TRIAL_S", 3.0)
-    # What hangs in the kernel outlives its kill, so nobody may wait for its end.
-    monkeypatch.setattr(subprocess.Popen, "wait", lambda *_, **__: pytest.fail("it was waited for"))
+    wait = subprocess.Popen.wait
+
+    def wait_for_others(process: subprocess.Popen[str], *args: Any, **named: Any) -> int:
+        # What hangs in the kernel outlives its kill, so nobody may wait for its end.
+        assert "worker.gpu_trial" not in process.args, "it was waited for"  # type: ignore[operator]
+        return wait(process, *args, **named)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", wait_for_others)
     with caplog.at_level(logging.ERROR):
         assert not is_found(tmp_path)
     assert caplog.messages == ["This machine's GPU is not used: it did not answer within 3 s"]
@@ -194,10 +224,55 @@ def test_a_pytorch_that_cannot_compute_on_the_gpu_is_named(
     ]
 
 
+@confined
+def test_a_compiler_that_lies_away_from_the_system_compiles_for_contained_stages(
+    machine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "toolchain"
+    for name in ("bin", "lib"):
+        (folder / name).mkdir(parents=True)
+    (folder / "lib" / "stddef.h").write_text("typedef unsigned long size_t;\n")
+    wrapper = folder / "bin" / "gcc"
+    wrapper.write_text(f'#!/bin/sh\nexec {COMPILER} -isystem {folder}/lib "$@"\n')
+    wrapper.chmod(0o755)
+    monkeypatch.setenv("CC", str(wrapper))
+    with caplog.at_level(logging.ERROR):
+        assert is_found(tmp_path)
+    assert not caplog.messages
+    # What was seen on a real machine: the program open, its headers closed.
+    monkeypatch.setattr("worker.containment.planning.compiler_folders", lambda _: [wrapper.parent])
+    with caplog.at_level(logging.ERROR):
+        assert is_found(tmp_path)
+    (said,) = caplog.messages
+    assert f"{folder}/lib/stddef.h: Permission denied" in said
+    assert "ten times slower" in said
+    assert "NERFWORKS_WORKER_STAGE_READABLE" in said
+    caplog.clear()
+    with caplog.at_level(logging.ERROR):
+        assert is_found(tmp_path, stage_readable=str(folder / "lib"))
+    assert not caplog.messages
+
+
+def test_a_machine_without_a_compiler_uses_its_gpu_slowly_and_says_so(
+    machine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("CC", str(tmp_path / "gone"))
+    with caplog.at_level(logging.ERROR):
+        assert is_found(tmp_path)
+    (said,) = caplog.messages
+    assert "FileNotFoundError" in said
+    assert "It needs a C compiler" in said
+    assert "STAGE_READABLE" not in said
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_a_contained_process_computes_on_this_machines_gpu(tmp_path: Path) -> None:
-    assert is_found(tmp_path)
+def test_a_contained_process_computes_on_this_machines_gpu_with_kernels_of_its_own(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.ERROR):
+        assert is_found(tmp_path)
+    assert not caplog.messages
 
 
 def test_a_worker_for_the_gpu_alone_does_not_start_without_one(

@@ -150,7 +150,8 @@ def _wrong_picture(model: Nerfacto) -> str | None:
 
 def engine_errors() -> tuple[type[Exception], ...]:
     """What may be raised where the engine cannot run: by PyTorch, by Triton, by the C compiler."""
-    known = (RuntimeError, NerfError, OSError, ValueError, ImportError, subprocess.SubprocessError)
+    of_torch = (RuntimeError, AssertionError)  # the latter from a PyTorch without CUDA
+    known = (*of_torch, NerfError, OSError, ValueError, ImportError, subprocess.SubprocessError)
     try:
         from triton.errors import TritonError
     except ImportError:  # no wheel for this platform

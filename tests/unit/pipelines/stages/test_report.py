@@ -161,6 +161,13 @@ def test_warnings_stand_beside_the_assets_they_are_about() -> None:
     report = build_report({**manifests, "assess": {**manifest, "summary": summary}}, record)
     assert report["assets"] == {"mesh": {"coverage": 0.2}}
     assert report["warnings"] == [warning]
+    slow = {"code": "slow_engine", "message": "m", "hint": "h", "details": {}}
+    manifests["train"] = {
+        **manifest,
+        "summary": {"num_train": 9, "num_test": 1, "warnings": [slow]},
+    }
+    report = build_report({**manifests, "assess": {**manifest, "summary": summary}}, record)
+    assert report["warnings"] == [slow, warning]
 
 
 def test_a_missing_stage_is_named(job: Workspace) -> None:

@@ -7,17 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from pipelines.errors import Cancelled, TrainingError
 from pipelines.manifest import RunHooks
-from pipelines.nerf.options.train import default_train_config
+from pipelines.nerf.options.train import TrainConfig, default_train_config
 from pipelines.nerf.training.checkpoint import load_checkpoint, load_model
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.focus import find_focus
 from pipelines.scene.gaze import gaze_of, told_by_cameras
 from pipelines.scene.trained_scene import TrainedScene
-from pipelines.stages.train import decided
+from pipelines.stages.train import decided, engine_warnings
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
@@ -31,6 +32,18 @@ def test_summary_says_what_was_trained(trained_job: Workspace) -> None:
     assert summary["train_psnr"] > 9.0
     assert set(summary["losses"]) >= {"rgb", "interlevel", "distortion", "camera"}
     assert summary["camera_deltas"]["max_translation"] > 0.0
+    assert (summary["device"], summary["engine"], summary["warnings"]) == ("cpu", "fast", [])
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine whose GPU does not work")
+def test_a_gpu_that_trained_without_its_engine_is_told() -> None:
+    config, gpu = TrainConfig(), torch.device("cuda")
+    (warning,) = engine_warnings(config, gpu, "plain")
+    assert warning["code"] == "slow_engine"
+    assert warning["details"]["problem"] in warning["message"]
+    assert engine_warnings(config, gpu, "fast") == []
+    assert engine_warnings(config, torch.device("cpu"), "plain") == []
+    assert engine_warnings(replace(config, engine="plain"), gpu, "plain") == []
 
 
 def test_plain_lines_are_for_cameras_that_stand_around_what_they_look_at(
