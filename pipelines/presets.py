@@ -129,7 +129,11 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                 {
                     "train": {"max_steps": 70_000},
                     "pointcloud": {"num_points": 3_000_000},
-                    "mesh": {"resolution": 512, "max_faces": 1_000_000},
+                    "mesh": {
+                        "resolution": 512,
+                        "render_long_side_px": 640,
+                        "max_faces": 1_000_000,
+                    },
                     "video": {"long_side_px": 1920},
                 },
             ),

@@ -72,7 +72,7 @@ class MeshOptions(CropOptions, TextureOptions):
         0, ge=0, le=5000, description="Training views fused, evenly picked; 0 for all."
     )
     render_long_side_px: int = Field(
-        640, ge=64, le=4096, description="Long side of the rendered depth, in pixels."
+        320, ge=64, le=4096, description="Long side of the rendered depth, in pixels."
     )
     refine: Literal["photos", "none"] = Field(
         "photos",

@@ -1,12 +1,15 @@
 """Depth views turned into a mesh by Poisson reconstruction: smooth, small holes closed.
 
 Each cube of space with a voxel's side gets one point, the mean of what the views show in it, where
-two views at least show something and the others do not look through it; a smooth surface is laid
-through the points along their normals. Where it strays from them, as it does across what nobody
-saw, it is cut away. It has the mean of the colours in which views see it. All happens in a frame
-whose origin is the middle of the bounds.
+two views at least show something, from places far enough apart, and the others do not look through
+it. Depths that tremble make layers of such points, some cubes thick: then each point moves onto the
+plane of those around it, and those that come into one cube become one. A smooth surface is laid
+through them along their normals. Where it strays from them, as it does across what nobody saw, it
+is cut away. It has the mean of the colours in which views see it. All happens in a frame whose
+origin is the middle of the bounds.
 
-Source: Kazhdan and Hoppe, "Screened Poisson Surface Reconstruction", 2013, as Open3D does it.
+Sources: Kazhdan and Hoppe, "Screened Poisson Surface Reconstruction", 2013, as Open3D does it;
+Alexa et al., "Point Set Surfaces", 2001, for the planes, of which one round is enough here.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from typing import Any
 import numpy as np
 import open3d
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pipelines.exports.apart import run_apart
 from pipelines.exports.each_view import each_view
@@ -34,11 +38,24 @@ from pipelines.scene.depth_views import DepthView
 
 _MIN_VIEWS = 2
 """A place that one view alone shows is not believed."""
+_PARALLAX = 0.04
+"""Radians, the standard deviation of the directions in which views see a cube: 4.6 degrees between
+two views. What frames of a film show that follow each other is one opinion, however many they are:
+where nobody saw it from elsewhere, it is as likely off the surface. docs/surfaces.md has what was
+measured."""
+_OF_ALL_EYES = 0.06
+"""And as a share of what all the views together could have, where that is less: far away."""
 MOST_POINTS = 2_000_000
 """Points for which there is room; cubes become larger where there would be more."""
 LARGE = 10_000
 """Points from which the solver gets a process of its own, whose start takes a second."""
 _COARSER = 1.05
+_AROUND_CUBES, _AROUND, _PORTION = 2.5, 64, 20_000
+"""How far around a point its plane is sought, by how many points at most, and for how many at a
+time."""
+_THIN, _THICK = 0.2, 0.3
+"""Cubes, the standard deviation of layers along their normals, in the median: up to the former
+points stay as they are, with the edges of things; from the latter on they lie on their planes."""
 _STRAY_CUBES = 2.0
 """The surface ends so many cubes from the nearest point."""
 _FEWEST = 30
@@ -55,7 +72,8 @@ _core: Any = open3d.core
 
 @dataclass(frozen=True)
 class _Sums:
-    """Of C cubes, by their number: [C, 9] summed place, colour and eye; [C] how many views."""
+    """Of C cubes, by their number: [C, 10] summed place, colour, eye, and the eye's square, places
+    and eyes from the bounds' least corner; [C] how many views."""
 
     key: NDArray[np.int64]
     total: Floats
@@ -142,26 +160,75 @@ def averaged(
     side: float,
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[Cloud, float]:
-    """A point for each cube that two views show, and the cubes' side, larger where they are many.
+    """A point for each cube that views show from different places, and the cubes' side, larger
+    where they are many.
 
     Each view has one vote in a cube: the mean of its pixels there.
     """
     left = 1.0  # of what is told: how often larger cubes are tried is not known
     while True:
-        sums = _Sums(np.zeros(0, np.int64), np.zeros((0, 9)), np.zeros(0, np.int64))
+        sums = _Sums(np.zeros(0, np.int64), np.zeros((0, 10)), np.zeros(0, np.int64))
         counts = np.ceil((bounds.box_max - bounds.box_min) / side).astype(np.int64) + 1
         shown = each_view(functools.partial(_means, bounds, side, counts), views)
+        eyes = []
         for done, (key, mean) in enumerate(shown):
             on_progress(1.0 - left * (1.0 - 0.5 * done / len(views)))
             sums = sums.with_one_more(key, mean)
-        agreed = sums.num_views >= _MIN_VIEWS
+            eyes += [mean[0, 6:9]] if len(key) else []
+        agreed = _agreed(sums, np.array(eyes).reshape(-1, 3))
         if int(agreed.sum()) <= MOST_POINTS:
             break
         side *= max(_COARSER, float(np.sqrt(agreed.sum() / MOST_POINTS)))
         left *= 0.5
-    found: Floats = sums.total[agreed] / sums.num_views[agreed][:, None]
-    colors = np.rint(found[:, 3:6]).astype(np.uint8)
-    return Cloud.seen(found[:, :3] + bounds.box_min, colors, found[:, 6:]), side
+    votes = sums.num_views[agreed].astype(np.float64)
+    found: Floats = sums.total[agreed] / votes[:, None]
+    found[:, :3] = _on_planes(found[:, :3], votes, side)
+    at = np.unique(_numbered(found[:, :3], side, counts), return_inverse=True)[1]
+    weight = np.bincount(at, votes)[:, None]
+    merged = np.stack([np.bincount(at, votes * column) for column in found.T], axis=1) / weight
+    colors = np.rint(merged[:, 3:6]).astype(np.uint8)
+    seen = Cloud.seen(merged[:, :3] + bounds.box_min, colors, merged[:, 6:9] + bounds.box_min)
+    return seen, side
+
+
+def _on_planes(points: Floats, votes: Floats, side: float) -> Floats:
+    """Points [P, 3], one of each cube, where they make thick layers each on the plane of those
+    around it, as their votes [P] weigh them."""
+    tree = cKDTree(points)
+    weights = np.append(votes, 0.0)  # of whom is not there
+    places = np.append(points, np.zeros((1, 3)), axis=0)
+    moves, thickness = np.zeros_like(points), np.zeros(len(points))
+    for begin in range(0, len(points), _PORTION):
+        some = slice(begin, begin + _PORTION)
+        _, near = tree.query(
+            points[some], _AROUND, distance_upper_bound=_AROUND_CUBES * side, workers=-1
+        )
+        weight = weights[near][:, :, None]
+        total = weight.sum(axis=1)
+        mean = (places[near] * weight).sum(axis=1) / total
+        away = places[near] - mean[:, None]
+        values, axes = np.linalg.eigh(
+            np.matmul((away * weight).transpose(0, 2, 1), away) / total[:, :, None]
+        )
+        normal = axes[:, :, 0]
+        moves[some] = normal * ((mean - points[some]) * normal).sum(axis=1)[:, None]
+        thickness[some] = np.sqrt(np.maximum(values[:, 0], 0.0)) / side
+    if len(points) == 0:
+        return points
+    share = np.clip((np.median(thickness) - _THIN) / (_THICK - _THIN), 0.0, 1.0)
+    laid: Floats = points + share * moves
+    return laid
+
+
+def _agreed(sums: _Sums, eyes: Floats) -> NDArray[np.bool_]:
+    """Which cubes [C] enough views show, from places far enough apart. eyes: [V, 3], all views'."""
+    mean = sums.total / sums.num_views[:, None]
+    spread = np.sqrt(np.maximum(mean[:, 9] - (mean[:, 6:9] ** 2).sum(axis=1), 0.0))
+    distance = np.linalg.norm(mean[:, :3] - mean[:, 6:9], axis=1)
+    possible = np.sqrt(eyes.var(axis=0).sum()) if len(eyes) else 0.0
+    wanted = np.minimum(_PARALLAX * distance, _OF_ALL_EYES * possible)
+    enough: NDArray[np.bool_] = (sums.num_views >= _MIN_VIEWS) & (spread >= wanted)
+    return enough
 
 
 def _means(
@@ -170,15 +237,21 @@ def _means(
     """The cubes that a view shows, and the mean of its pixels there. counts: [3], cubes along each
     axis."""
     mask = bounds.mask(view)
-    points = view.points()[mask]
-    cubes = np.floor((points - bounds.box_min) / side).astype(np.int64)
-    cubes = np.clip(cubes, 0, counts - 1)
-    flat = (cubes[:, 0] * counts[1] + cubes[:, 1]) * counts[2] + cubes[:, 2]
-    eyes = np.broadcast_to(view.world_from_camera[:, 3], points.shape)
-    told = np.concatenate([points - bounds.box_min, view.rgb[mask], eyes], axis=1)
+    points = view.points()[mask] - bounds.box_min
+    flat = _numbered(points, side, counts)
     key, at, pixels = np.unique(flat, return_inverse=True, return_counts=True)
-    total = np.stack([np.bincount(at, told[:, column], len(key)) for column in range(9)], axis=1)
-    return key, total / pixels[:, None]
+    told = np.concatenate([points, view.rgb[mask]], axis=1)
+    total = np.stack([np.bincount(at, told[:, column], len(key)) for column in range(6)], axis=1)
+    eye = view.world_from_camera[:, 3] - bounds.box_min
+    eyes = np.broadcast_to(np.append(eye, eye @ eye), (len(key), 4))
+    return key, np.concatenate([total / pixels[:, None], eyes], axis=1)
+
+
+def _numbered(points: Floats, side: float, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The cubes of points [P, 3] that are counted from the bounds' least corner."""
+    cubes = np.clip(np.floor(points / side).astype(np.int64), 0, counts - 1)
+    numbers: NDArray[np.int64] = (cubes[:, 0] * counts[1] + cubes[:, 1]) * counts[2] + cubes[:, 2]
+    return numbers
 
 
 def _near(mesh: TriangleMesh, points: Floats, reach: float) -> TriangleMesh:

@@ -71,6 +71,21 @@ def test_it_is_smoother_than_fused_voxels(ball: TriangleMesh, views: list[DepthV
     assert bend(ball) < 0.7 * bend(fuse(views, BOUNDS, VOXEL))
 
 
+def test_depths_that_tremble_by_a_voxel_make_no_rough_surface() -> None:
+    """Many views with fine pixels fill a layer of cubes around the surface."""
+    noise = np.random.default_rng(1)
+    fine = Pinhole(400, 300, 375.0, 375.0, 200.0, 150.0)
+    seen = [sphere_view(fine, pose, CENTER) for pose in ring(48, CENTER)]
+    shake = [2.0 * NOISE * noise.normal(size=view.z_depth.shape) for view in seen]
+    trembling = [
+        replace(view, z_depth=(view.z_depth * (1.0 + one)).astype(np.float32))
+        for view, one in zip(seen, shake, strict=True)
+    ]
+    made = reconstruct(trembling, BOUNDS, VOXEL)
+    assert bend(made) < 0.05
+    assert off(made).mean() < 0.3 * VOXEL
+
+
 def test_what_nobody_saw_stays_open(views: list[DepthView]) -> None:
     """From one side alone: the other half, which would close the ball, is not made up."""
     poses = np.stack([view.world_from_camera[:, 3] - CENTER for view in views])
@@ -87,6 +102,59 @@ def test_a_ghost_seen_by_one_view_is_not_believed(views: list[DepthView]) -> Non
     depth[:20, :20] = 0.6 * np.linalg.norm(views[0].world_from_camera[:, 3] - CENTER)
     haunted = reconstruct([replace(views[0], z_depth=depth), *views[1:]], BOUNDS, VOXEL)
     assert off(haunted).max() < VOXEL
+
+
+def haunted_film(views: list[DepthView], step: float, frames: int = 6) -> list[DepthView]:
+    """The views and frames of a film beside the first one, step by step to its right, which all
+    see a wall in the air, at one place, that no other sees."""
+    pose = views[0].world_from_camera
+    z = 0.6 * float(np.linalg.norm(pose[:, 3] - CENTER))
+    told = []
+    for frame in range(frames):
+        moved = pose.copy()
+        moved[:, 3] += step * frame * pose[:, 0]
+        seen = sphere_view(LENS, moved, CENTER)
+        depth = seen.z_depth.copy()
+        left = 70 - round(step * frame * LENS.fl_x / z)
+        depth[50:70, left : left + 20] = z
+        told.append(replace(seen, z_depth=depth))
+    return [*views, *told]
+
+
+def points_off(views: list[DepthView]) -> int:
+    """How many of the points that are believed are not on the ball."""
+    cloud, _ = averaged(views, BOUNDS, VOXEL)
+    return int((np.abs(np.linalg.norm(cloud.points - CENTER, axis=1) - 1.0) > 0.2).sum())
+
+
+def test_frames_that_follow_each_other_do_not_confirm_each_other(views: list[DepthView]) -> None:
+    assert points_off(views) == 0
+    assert points_off(haunted_film(views, 0.01)) == 0
+    assert points_off(haunted_film(views, 0.01, frames=12)) == 0, "more of them are not more"
+    assert points_off(haunted_film(views, 0.1)) > 20, "seen from places apart it is a thing"
+
+
+def wall_views(distance: float, eyes: list[float]) -> list[DepthView]:
+    """Of a wall before cameras that stand side by side and look ahead."""
+    pose = np.eye(4)[:3]
+    depth = np.full((LENS.height, LENS.width), distance, np.float32)
+    white = np.full((LENS.height, LENS.width, 3), 255, np.uint8)
+    return [
+        DepthView(LENS, np.column_stack([pose[:, :3], [eye, 0.0, 0.0]]), white, depth)
+        for eye in eyes
+    ]
+
+
+@pytest.mark.parametrize("distance", [20.0, 2000.0])
+def test_what_is_far_is_believed_where_all_that_could_see_it_do(distance: float) -> None:
+    wall = np.array([0.0, 0.0, -distance])
+    bounds = SceneBounds(wall, distance, 10.0 * distance, wall - distance, wall + distance)
+    voxel = distance / 20.0
+    eyes = [-2.0, -1.0, 0.0, 1.0, 2.0]
+    assert len(averaged(wall_views(distance, eyes), bounds, voxel)[0]) > 200
+    near = wall_views(distance, [0.0, 0.01])
+    aside = wall_views(1.5 * distance, [-2.0]) + wall_views(0.6 * distance, [2.0])
+    assert len(averaged([*near, *aside], bounds, voxel)[0]) == 0
 
 
 def test_the_same_views_give_the_same_mesh_to_the_last_bit(
