@@ -7,7 +7,9 @@ PyTorch can and kernels of our own cannot be compiled: training is then some ten
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+import tempfile
 
 CANNOT_COMPUTE, CANNOT_COMPILE = 1, 3
 
@@ -41,12 +43,15 @@ def kernel_problem() -> str | None:
     """Why Triton cannot compile for the GPU; None where it can.
 
     It needs a C compiler with all that belongs to one, Python's headers, and NVIDIA's assembler,
-    which it brings along.
+    which it brings along. What it compiled for another trial, which may have been allowed more,
+    does not count.
     """
     try:
-        from pipelines.nerf.engines.gpu.parts.trial_kernel import doubled
+        with tempfile.TemporaryDirectory() as empty:
+            os.environ["TRITON_CACHE_DIR"] = empty  # before Triton is imported
+            from pipelines.nerf.engines.gpu.parts.trial_kernel import doubled
 
-        total = doubled(1000)
+            total = doubled(1000)
     except Exception as error:  # noqa: BLE001 -- of Triton, compilers, the driver: it is told
         reason = (str(error).splitlines() or [""])[0]
         return f"{type(error).__name__}: {reason}"
