@@ -182,7 +182,11 @@ def averaged(
         left *= 0.5
     votes = sums.num_views[agreed].astype(np.float64)
     found: Floats = sums.total[agreed] / votes[:, None]
-    found[:, :3] = _on_planes(found[:, :3], votes, side)
+
+    def on_part(done: float) -> None:
+        on_progress(1.0 - left * 0.5 * (1.0 - done))
+
+    found[:, :3] = _on_planes(found[:, :3], votes, side, on_part)
     at = np.unique(_numbered(found[:, :3], side, counts), return_inverse=True)[1]
     weight = np.bincount(at, votes)[:, None]
     merged = np.stack([np.bincount(at, votes * column) for column in found.T], axis=1) / weight
@@ -191,14 +195,20 @@ def averaged(
     return seen, side
 
 
-def _on_planes(points: Floats, votes: Floats, side: float) -> Floats:
+def _on_planes(
+    points: Floats, votes: Floats, side: float, on_progress: Callable[[float], None]
+) -> Floats:
     """Points [P, 3], one of each cube, where they make thick layers each on the plane of those
-    around it, as their votes [P] weigh them."""
+    around it, as their votes [P] weigh them. on_progress: told the share that is done; may raise.
+    """
+    if len(points) == 0:
+        return points
     tree = cKDTree(points)
     weights = np.append(votes, 0.0)  # of whom is not there
     places = np.append(points, np.zeros((1, 3)), axis=0)
     moves, thickness = np.zeros_like(points), np.zeros(len(points))
     for begin in range(0, len(points), _PORTION):
+        on_progress(begin / len(points))
         some = slice(begin, begin + _PORTION)
         _, near = tree.query(
             points[some], _AROUND, distance_upper_bound=_AROUND_CUBES * side, workers=-1
@@ -213,8 +223,6 @@ def _on_planes(points: Floats, votes: Floats, side: float) -> Floats:
         normal = axes[:, :, 0]
         moves[some] = normal * ((mean - points[some]) * normal).sum(axis=1)[:, None]
         thickness[some] = np.sqrt(np.maximum(values[:, 0], 0.0)) / side
-    if len(points) == 0:
-        return points
     share = np.clip((np.median(thickness) - _THIN) / (_THICK - _THIN), 0.0, 1.0)
     laid: Floats = points + share * moves
     return laid

@@ -184,8 +184,11 @@ def test_too_little_is_no_surface(views: list[DepthView]) -> None:
     assert len(reconstruct(blind, BOUNDS, VOXEL).faces) == 0
 
 
-@pytest.mark.parametrize("at", [0.1, 0.45, 0.6])
-def test_a_cancel_ends_it_in_any_part(views: list[DepthView], at: float) -> None:
+@pytest.mark.parametrize("at", [0.1, 0.3, 0.45, 0.6])
+def test_a_cancel_ends_it_in_any_part(
+    views: list[DepthView], at: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(poisson, "_PORTION", 1000)  # of 11,000 points
     told: list[float] = []
 
     def tell(done: float) -> None:
@@ -196,3 +199,4 @@ def test_a_cancel_ends_it_in_any_part(views: list[DepthView], at: float) -> None
     with pytest.raises(Cancelled):
         reconstruct(views, BOUNDS, VOXEL / 4.0, tell)
     assert told == sorted(told)
+    assert told[-1] < at + 0.1
