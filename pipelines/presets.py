@@ -32,6 +32,14 @@ _SMALL_PICTURES: dict[str, Any] = {
     "poses": {"max_image_px": 960, "num_features": 4096},
 }
 
+# docs/speed.md, "The preview's rate", has the measurements.
+_SHORT_RUN: dict[str, Any] = {
+    "lr_final": 1e-5,
+    "decay": "linear",
+    "decay_steps": 0,
+    "table_decay": 3e-8,
+}
+
 PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
     {
         preset.name: preset
@@ -79,14 +87,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                             "camera_mode": "off",
                         },
                         "data": {"long_side_px": 480},
-                        # docs/speed.md, "The preview's rate", has the measurements.
-                        "optimizer": {
-                            "lr": 0.015,
-                            "lr_final": 1e-5,
-                            "decay": "linear",
-                            "decay_steps": 0,
-                            "table_decay": 3e-8,
-                        },
+                        "optimizer": {**_SHORT_RUN, "lr": 0.015},
                     },
                     "pointcloud": {"num_points": 200_000},
                     "mesh": {"render_long_side_px": 240},
@@ -111,7 +112,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                             "camera_mode": "off",
                         },
                         "data": {"long_side_px": 800},
-                        "optimizer": {"lr": 0.01, "decay_steps": 0, "lr_final": 3e-4},
+                        "optimizer": _SHORT_RUN,
                     },
                     "pointcloud": {"num_points": 500_000},
                     "mesh": {
