@@ -212,7 +212,10 @@ def process(tmp_path: Path) -> Iterator[ApiProcess]:
     made.kill()
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(),
+    reason="what an upload takes of memory is NOT tested: there is no /proc to read it from",
+)
 def test_large_upload_takes_little_memory_on_both_sides(
     process: ApiProcess, tmp_path: Path
 ) -> None:
