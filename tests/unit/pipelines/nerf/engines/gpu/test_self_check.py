@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -183,10 +184,66 @@ def test_few_rays_that_are_wrong_are_named_where_their_mean_is_small(
         seen["rgb"][: len(rays) // 25] += 0.2  # 0.008 in the mean of all
         return seen
 
-    monkeypatch.setattr(self_check, "NUM_RAYS", 100)
+    monkeypatch.setattr(self_check, "PICTURE_RAYS", 100)
     monkeypatch.setattr(TileDrawer, "draw", spoiled)
     model = Nerfacto(tiny_config().model, 4)  # type: ignore[arg-type]
     assert "2 % of its colours are off by 0.2" in str(picture_problem(model))
+
+
+def sharp_model() -> Nerfacto:
+    """Of surfaces so sharp that coarser numbers make some rays miss them."""
+    torch.manual_seed(0)
+    model = Nerfacto(tiny_config().model, 4)  # type: ignore[arg-type]
+    for name, parameter in model.named_parameters():
+        parameter.data.mul_(10_000.0 if name.endswith("table") else 5.0)
+    return model
+
+
+def with_numbers_of(model: Nerfacto, dtype: torch.dtype, rays: Rays) -> dict[str, Tensor]:
+    coarse = copy.deepcopy(model)
+    for parameter in coarse.parameters():
+        parameter.data = parameter.data.to(dtype).float()
+    with torch.no_grad():
+        return coarse(rays)
+
+
+def test_rays_that_rounding_moves_say_nothing_of_the_renderer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = sharp_model()
+    moved: list[Tensor] = []
+
+    def rounded(drawer: TileDrawer, rays: Rays) -> dict[str, Tensor]:
+        found = with_numbers_of(model, torch.bfloat16, rays)
+        moved.append((found["rgb"] - model(rays)["rgb"]).abs())
+        return found
+
+    monkeypatch.setattr(TileDrawer, "draw", rounded)
+    assert picture_problem(model) is None
+    (of_all,) = moved
+    assert of_all.flatten().quantile(self_check.FEW) > self_check.COLOR_TOLERANCE_OF_FEW
+
+
+def test_wrong_colours_are_named_where_rounding_moves_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = sharp_model()
+
+    def spoiled(drawer: TileDrawer, rays: Rays) -> dict[str, Tensor]:
+        seen = with_numbers_of(model, torch.bfloat16, rays)
+        seen["rgb"][::25] += 0.3
+        return seen
+
+    monkeypatch.setattr(TileDrawer, "draw", spoiled)
+    assert "colours are off" in str(picture_problem(model))
+
+
+def test_nothing_is_trusted_where_all_colours_hang_on_rounding(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(self_check, "STEADY", -1.0)
+    model = Nerfacto(tiny_config().model, 4)  # type: ignore[arg-type]
+    assert picture_problem(model) == "the colours of 1024 of 1024 rays hang on rounding"
 
 
 def test_a_renderer_that_cannot_run_is_a_problem_and_no_error(
