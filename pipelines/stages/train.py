@@ -379,7 +379,7 @@ def _corrections(
     """Rotations [N, 3, 3] and translations [N, 3], scene units, of the training cameras."""
     if delta.mode == "off":
         return np.tile(np.eye(3), (num, 1, 1)), np.zeros((num, 3))
-    tangent = delta.tangent.detach().cpu().double()
+    tangent = delta.corrections().detach().cpu().double()
     if delta.mode == "se3":
         rotation, shift = se3_exp(tangent)
     else:

@@ -10,7 +10,7 @@ its warm-up (proposals learn in every 5th step), a new model for each way, in tu
 captured step with Triton kernels; `eager`, the same kernels started one by one; with `--vs plain`
 also PyTorch's definitions. The first steps of each (`--skip`: compiling, capturing) are not
 counted. Then: time by phase and by kernel, networks fused and layer by layer, bytes and operations
-from the shapes (`gpu_counts`) with the least time that a device could need, the preset `standard`
+from the shapes (`gpu_counts`) with the least time that a device could need, the paper's settings
 as it is (`--run-steps`; 0 leaves it out) with the PSNR of its held-out images, and pictures of what
 it learned. The capture is a scene in closed form unless `--capture` names a folder.
 
@@ -181,7 +181,7 @@ def report(
         rows.append([f"training, {way}, steps/s", number(rate, 1), _goal(rate, GOAL_STEPS_PER_S)])
     if run is not None:
         text = f"{GOAL_RUN_S:.0f}: {'met' if run.wall_s < GOAL_RUN_S else 'missed'}"
-        rows.append([f"{run.steps} steps of `standard`, s", number(run.wall_s, 1), text])
+        rows.append([f"{run.steps} steps of the paper's settings, s", number(run.wall_s, 1), text])
     for name, found in frames.items():
         rate = 1.0 / statistics.median(found.seconds)
         close = "" if found.psnr is None else f", {found.psnr:.1f} dB from plain"
@@ -300,7 +300,7 @@ def steps_measured(
 
 
 def standard(rays: int) -> TrainConfig:
-    """The preset `standard`, the paper's model, by the GPU engine with its images on the GPU."""
+    """The paper's settings by the GPU engine with its images on the GPU."""
     base = TrainConfig()
     data = replace(base.data, images_on_gpu=True, long_side_px=max(MADE_WIDTH, MADE_HEIGHT))
     return replace(base, rays_per_step=rays, device="cuda", engine="fast", data=data)

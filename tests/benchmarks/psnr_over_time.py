@@ -1,7 +1,7 @@
 """PSNR on held-out images against seconds of training: a table, JSON and a picture.
 
     python -m tests.benchmarks.psnr_over_time ../shared/captures/photos-fox
-        [--preset standard] [--method nerfacto] [--seeds 3] [--seconds 5,10,20,45] [--steps 1000]
+        [--preset paper] [--method nerfacto] [--seeds 3] [--seconds 5,10,20,45] [--steps 1000]
         [--marks 50,100] [--set model.x=1] [--png out/psnr.png] [--json out/psnr.json]
 
 Marks are seconds of training or, with --marks, steps. On `photos-fox` the mean is over the images
@@ -140,7 +140,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("capture", type=Path)
-    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--preset", default="paper")
     parser.add_argument("--method", default="nerfacto")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seconds", default=DEFAULT_SECONDS)

@@ -24,11 +24,12 @@ SAMPLINGS = ("paper", "preview")
 
 
 def preset_config(name: str) -> TrainConfig:
-    """The training options of a preset. `standard` is the paper's and needs no pydantic.
+    """The training options of a preset. `paper`, which is none, is the
+    defaults and needs no pydantic.
 
     Raises NerfError `bad_config` where there is no such preset or no pydantic.
     """
-    if name in ("standard", "paper"):
+    if name == "paper":
         return TrainConfig()
     try:
         from pipelines.presets import PRESETS
@@ -36,7 +37,7 @@ def preset_config(name: str) -> TrainConfig:
         raise NerfError(
             "bad_config",
             f"The preset {name} cannot be read: {error}.",
-            "Install pydantic, or use standard and --set.",
+            "Install pydantic, or use paper and --set.",
         ) from error
     if name not in PRESETS:
         raise NerfError("bad_config", f"There is no preset {name}: {', '.join(PRESETS)}.")

@@ -3,6 +3,11 @@
 Symbols: per camera six numbers [t, omega], zero at the start; t a translation in scene units, omega
 a rotation vector in radians, both in scene axes about the camera centre: origin += t (for SE(3) the
 left Jacobian times t), direction = R direction.
+
+A scene that moves with its cameras looks the same to them, so nothing but chance decides whether
+all of them move together. In Adam's first steps, when little is learned, they do, by a fraction of
+a degree, and views that were held out, depth maps and points stay behind (docs/poses.md, "Corrected
+poses"). `keep_frame` takes such motions off.
 """
 
 from __future__ import annotations
@@ -16,6 +21,8 @@ from pipelines.nerf.space.rays import Rays
 
 SERIES_BELOW = 1e-4
 """Squared angle below which the series replace sin(a)/a and the like, which lose digits there."""
+DEPENDENT_BELOW = 1e-3
+"""Singular values, as a share of the largest, of motions that others are made of already."""
 
 
 def so3_exp(omega: Tensor) -> Tensor:
@@ -39,6 +46,28 @@ def se3_exp(tangent: Tensor) -> tuple[Tensor, Tensor]:
     return so3_exp(omega), (left @ shift[..., None]).squeeze(-1)
 
 
+def common_motions(directions: Tensor) -> Tensor:
+    """What all cameras may do together, the scene following: [N, 6, K], K <= 12, orthonormal.
+
+    directions: [N, 3], along the optical axes, scene axes, unit length.
+    A shift of all; a turn of all; the turns with which cameras that stay where they are follow a
+    scene that is shifted by e, direction x e if it is equally far from all; and those for a scene
+    that is turned about e, (direction . e) direction.
+    """
+    axes = directions.detach().double().cpu()
+    num = len(axes)
+    eye = torch.eye(3, dtype=torch.float64)
+    same = eye.expand(num, 3, 3)
+    shifted = torch.linalg.cross(axes[:, None, :].expand(num, 3, 3), same).transpose(1, 2)
+    turned = axes[:, :, None] * axes[:, None, :]
+    motions = torch.zeros(num, 6, 12, dtype=torch.float64)
+    motions[:, :3, :3] = same
+    motions[:, 3:, 3:] = torch.cat([same, shifted, turned], dim=-1)
+    basis, sizes, _ = torch.linalg.svd(motions.reshape(6 * num, 12), full_matrices=False)
+    kept: Tensor = basis[:, sizes > DEPENDENT_BELOW * sizes.max()]
+    return kept.reshape(num, 6, -1).to(directions)
+
+
 class CameraOptimizer(nn.Module):
     """Corrections [N, 6] of N training cameras, applied to rays while training.
 
@@ -59,12 +88,26 @@ class CameraOptimizer(nn.Module):
         self.rotation_penalty = rotation_penalty
         rows = 0 if mode == "off" else num_cameras
         self.tangent = nn.Parameter(torch.zeros(rows, 6))
+        self.common: Tensor
+        self.register_buffer("common", torch.zeros(rows, 6, 0), persistent=False)
+
+    def keep_frame(self, directions: Tensor) -> None:
+        """From now on corrections have nothing of `common_motions`. directions: [N, 3]."""
+        if self.mode != "off":
+            self.common = common_motions(directions).to(self.tangent)
+
+    def corrections(self) -> Tensor:
+        """[t, omega] [N, 6] as they are applied: of `tangent`, what cameras do not do together."""
+        # Adam makes whole steps of small gradients: no camera gets a share of another's.
+        tangent = self.tangent.detach()[..., None]
+        together = (self.common * (self.common * tangent).sum(dim=(0, 1))).sum(dim=-1)
+        return self.tangent - together
 
     def apply_to(self, rays: Rays) -> Rays:
         """The rays with each camera's correction; `camera_indices` are training indices."""
         if self.mode == "off":
             return rays
-        tangent = self.tangent.index_select(0, rays.camera_indices)
+        tangent = self.corrections().index_select(0, rays.camera_indices)
         # Products of half precision would turn every ray by a thousandth.
         with torch.autocast(tangent.device.type, enabled=False):
             if self.mode == "se3":
@@ -78,8 +121,9 @@ class CameraOptimizer(nn.Module):
         """Weighted mean lengths of the translations and rotations; a scalar."""
         if self.mode == "off":
             return self.tangent.sum()
-        moved = self.tangent[:, :3].norm(dim=-1).mean()
-        turned = self.tangent[:, 3:].norm(dim=-1).mean()
+        corrections = self.corrections()
+        moved = corrections[:, :3].norm(dim=-1).mean()
+        turned = corrections[:, 3:].norm(dim=-1).mean()
         penalty: Tensor = self.translation_penalty * moved + self.rotation_penalty * turned
         return penalty
 

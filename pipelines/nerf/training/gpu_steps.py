@@ -185,6 +185,7 @@ class GpuSteps:
             device,
             state.pixel_random.device,
         )
+        fresh.model.cameras_delta.common = state.model.cameras_delta.common
         fresh.restore(kept)
         fresh.elapsed_s = state.elapsed_s  # time that was spent stays spent
         fresh.model.train()

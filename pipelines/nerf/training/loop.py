@@ -105,6 +105,7 @@ def train(
     fingerprint = _fingerprint(config, seed, posed, supervision)
     pixels_on = pixel_device(config, device, images.nbytes)
     state = initial_state(config, len(train_indices), seed, device, pixels_on)
+    state.model.cameras_delta.keep_frame(posed.scene_from_camera[:, :, 2])
     if checkpoint_path is not None and checkpoint_path.exists():
         _resume(state, checkpoint_path, fingerprint)
     pixels_on = state.pixel_random.device

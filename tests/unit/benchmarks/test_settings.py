@@ -83,7 +83,8 @@ def test_preview_is_the_default_with_the_presets_own_differences() -> None:
 
     config = preset_config("preview")
     check(PRESETS["preview"].overrides["train"], config)
-    assert preset_config("standard") == TrainConfig()
+    assert preset_config("paper") == TrainConfig()
+    check(PRESETS["standard"].overrides["train"], preset_config("standard"))
     with pytest.raises(NerfError, match="no preset"):
         preset_config("huge")
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
-from pipelines.nerf.space.camera_optimizer import CameraOptimizer, se3_exp, so3_exp
+from pipelines.nerf.space.camera_optimizer import (
+    CameraOptimizer,
+    common_motions,
+    se3_exp,
+    so3_exp,
+)
 from pipelines.nerf.space.rays import Rays
 
 
@@ -65,6 +72,76 @@ def test_a_quarter_turn_about_z_takes_x_to_y() -> None:
     moved = optimizer.apply_to(rays)
     assert torch.allclose(moved.directions, torch.eye(3)[[0, 1]], atol=1e-6)
     assert torch.allclose(moved.origins, torch.tensor([[0.0, 0, 0], [0.1, 0.2, 0.3]]))
+
+
+def _orbit(num: int) -> torch.Tensor:
+    """Optical axes [N, 3] of cameras around the origin that look at it, some from above."""
+    angle = torch.arange(num) * (2 * math.pi / num)
+    axes = torch.stack([angle.cos(), angle.sin(), 0.3 + 0.2 * (3 * angle).sin()], dim=-1)
+    return axes / axes.norm(dim=-1, keepdim=True)
+
+
+def test_common_motions_are_orthonormal_and_as_many_as_there_are() -> None:
+    for axes, num in ((_orbit(20), 12), (torch.tensor([[0.0, 0.0, 1.0]]).expand(9, 3), 6)):
+        motions = common_motions(axes).flatten(0, 1)
+        assert motions.shape == (6 * len(axes), num)
+        assert torch.allclose(motions.T @ motions, torch.eye(num), atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["so3xr3", "se3"])
+def test_what_the_cameras_do_together_moves_none_of_them(mode: str) -> None:
+    axes = _orbit(20)
+    optimizer = CameraOptimizer(20, mode)
+    optimizer.keep_frame(axes)
+    rays = Rays(-2.0 * axes, axes, torch.arange(20))
+    with torch.no_grad():
+        optimizer.tangent.normal_(std=0.01, generator=torch.Generator().manual_seed(0))
+    expected = optimizer.apply_to(rays)
+    shift, turn, aside = torch.tensor([[0.1, -0.2, 0.3], [0.02, 0.01, -0.03], [0.05, 0.0, 0.04]])
+    with torch.no_grad():
+        optimizer.tangent[:, :3] += shift
+        optimizer.tangent[:, 3:] += turn
+        # Cameras at two units from the origin that follow a scene shifted by two times `aside`.
+        optimizer.tangent[:, 3:] += torch.linalg.cross(axes, aside.expand_as(axes))
+    moved = optimizer.apply_to(rays)
+    assert not torch.allclose(moved.directions, axes, atol=1e-3)
+    assert torch.allclose(moved.origins, expected.origins, atol=1e-5)
+    assert torch.allclose(moved.directions, expected.directions, atol=1e-5)
+
+
+def test_a_scene_that_is_shifted_is_not_followed() -> None:
+    """The cameras' best turns towards a shifted point, which is what training would find."""
+    axes, offset = _orbit(40), torch.tensor([0.003, -0.002, 0.004])
+    aim = 2.0 * axes + offset
+    turns = torch.linalg.cross(axes, aim / aim.norm(dim=-1, keepdim=True))
+    optimizer = CameraOptimizer(40, "so3xr3")
+    with torch.no_grad():
+        optimizer.tangent[:, 3:] = turns
+    assert optimizer.corrections().norm(dim=-1).max() > 1e-3
+    optimizer.keep_frame(axes)
+    assert optimizer.corrections().norm(dim=-1).max() < 1e-5
+
+
+def test_a_camera_that_is_off_alone_is_corrected() -> None:
+    axes = _orbit(40)
+    optimizer = CameraOptimizer(40, "so3xr3")
+    optimizer.keep_frame(axes)
+    with torch.no_grad():
+        optimizer.tangent[7, 3:] = torch.tensor([0.01, 0.02, -0.01])
+    found = optimizer.corrections()
+    assert torch.allclose(found[7, 3:], optimizer.tangent[7, 3:], rtol=0.3)
+    others = torch.cat([found[:7], found[8:]])
+    assert others.norm(dim=-1).max() < 0.2 * found[7].norm()
+
+
+def test_a_camera_that_no_ray_came_from_gets_no_gradient() -> None:
+    optimizer = CameraOptimizer(3, "so3xr3")
+    optimizer.keep_frame(torch.eye(3))
+    moved = optimizer.apply_to(Rays(torch.rand(2, 3), torch.eye(3)[:2], torch.tensor([0, 2])))
+    (moved.origins.sum() + moved.directions[:, 1].sum()).backward()
+    gradient = optimizer.tangent.grad
+    assert gradient is not None
+    assert gradient.any(dim=1).tolist() == [True, False, True]
 
 
 def test_penalty_is_the_weighted_mean_length() -> None:
