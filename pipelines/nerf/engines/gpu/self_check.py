@@ -327,6 +327,8 @@ def _start(config: TrainConfig, device: torch.device, setting: Setting, engine: 
     torch.manual_seed(0)
     build = find_method(config.method).build
     model: Model = build(config.model, NUM_IMAGES).to(device).train()
+    cameras = _cameras(all_lenses=setting.all_lenses).to(device)
+    model.cameras_delta.keep_frame(cameras.scene_from_camera[:, :, 2])
     model.set_engine(engine)
     eps = config.optimizer.eps
     optimizers = {
@@ -347,7 +349,7 @@ def _start(config: TrainConfig, device: torch.device, setting: Setting, engine: 
         optimizers,
         loss_scaler(device, NUM_RAYS),
         sampler,
-        _cameras(all_lenses=setting.all_lenses).to(device),
+        cameras,
         NUM_RAYS,
         pixel_random=pixel_random,
         model_random=model_random,
