@@ -356,6 +356,8 @@ def _fingerprint(
         "known_depths": known,
         "cameras": _digest(cameras),
     }
+    if config.model.camera_mode != "off":
+        run["keeps_frame"] = True  # earlier versions' models drifted with their cameras
     return json.dumps(run, sort_keys=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -176,6 +177,26 @@ def test_a_checkpoint_of_another_run_is_refused(
     with pytest.raises(NerfError, match="other options") as caught:
         train(images, cameras, [0, 1, 2], config, seed=1, checkpoint_path=path)
     assert caught.value.code == "bad_checkpoint"
+
+
+@pytest.mark.parametrize("mode", ["so3xr3", "off"])
+def test_a_checkpoint_whose_cameras_may_have_drifted_together_is_refused(
+    images: ImageData, cameras: Cameras, tmp_path: Path, mode: str
+) -> None:
+    path = tmp_path / "checkpoint.pt"
+    config = tiny_config(max_steps=2)
+    config = replace(config, model=replace(config.model, camera_mode=mode))
+    train(images, cameras, [0, 1, 2], config, seed=0, checkpoint_path=path)
+    state = torch.load(path, weights_only=True)
+    run = json.loads(state["fingerprint"])
+    kept = run.pop("keeps_frame", False)  # as versions wrote it that let them
+    torch.save({**state, "fingerprint": json.dumps(run, sort_keys=True)}, path)
+    assert kept is (mode != "off")
+    if mode == "off":
+        train(images, cameras, [0, 1, 2], config, seed=0, checkpoint_path=path)
+        return
+    with pytest.raises(NerfError, match="other options"):
+        train(images, cameras, [0, 1, 2], config, seed=0, checkpoint_path=path)
 
 
 def test_a_loss_that_is_not_finite_is_named(images: ImageData, cameras: Cameras) -> None:
