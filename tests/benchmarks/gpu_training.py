@@ -68,7 +68,7 @@ class Run:
             "cameras": (self.model.cameras_delta.parameters(), rates.camera_lr),
         }
         cameras: Cameras = capture.cameras.select(capture.train).to(device)
-        self.model.cameras_delta.keep_frame(cameras.scene_from_camera[:, :, 2])
+        self.model.cameras_delta.keep_frame(cameras.scene_from_camera)
         self.step = TrainingStep(
             self.model,
             {

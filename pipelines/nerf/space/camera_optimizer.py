@@ -23,6 +23,8 @@ SERIES_BELOW = 1e-4
 """Squared angle below which the series replace sin(a)/a and the like, which lose digits there."""
 DEPENDENT_BELOW = 1e-3
 """Singular values, as a share of the largest, of motions that others are made of already."""
+SMALLEST_SPREAD = 1e-9
+"""Scene units between cameras that all stand in one place."""
 
 
 def so3_exp(omega: Tensor) -> Tensor:
@@ -46,26 +48,32 @@ def se3_exp(tangent: Tensor) -> tuple[Tensor, Tensor]:
     return so3_exp(omega), (left @ shift[..., None]).squeeze(-1)
 
 
-def common_motions(directions: Tensor) -> Tensor:
-    """What all cameras may do together, the scene following: [N, 6, K], K <= 12, orthonormal.
+def common_motions(scene_from_camera: Tensor) -> Tensor:
+    """What all cameras may do together, the scene following: [N, 6, K], K <= 30, orthonormal.
 
-    directions: [N, 3], along the optical axes, scene axes, unit length.
-    A shift of all; a turn of all; the turns with which cameras that stay where they are follow a
-    scene that is shifted by e, direction x e if it is equally far from all; and those for a scene
-    that is turned about e, (direction . e) direction.
+    scene_from_camera: [N, 3, 4].
+    Shifts and turns that are the same for all or change evenly with the place: a scene that is
+    moved, turned, scaled or bent a little has them. And the turns with which cameras that stay
+    where they are follow a scene that is shifted by e, axis x e if it is equally far from all, or
+    turned about e, (axis . e) axis.
     """
-    axes = directions.detach().double().cpu()
-    num = len(axes)
+    poses = scene_from_camera.detach().double().cpu()
+    num, axes, places = len(poses), poses[:, :, 2], poses[:, :, 3]
     eye = torch.eye(3, dtype=torch.float64)
     same = eye.expand(num, 3, 3)
-    shifted = torch.linalg.cross(axes[:, None, :].expand(num, 3, 3), same).transpose(1, 2)
+    away = places - places.mean(dim=0)
+    # One unit is how far cameras usually are from their middle, whatever the scene's scale.
+    away = away / away.square().sum(dim=-1).mean().sqrt().clamp_min(SMALLEST_SPREAD)
+    even = torch.einsum("nk,ij->nikj", away, eye).reshape(num, 3, 9)
+    followed = torch.linalg.cross(axes[:, None, :].expand(num, 3, 3), same).transpose(1, 2)
     turned = axes[:, :, None] * axes[:, None, :]
-    motions = torch.zeros(num, 6, 12, dtype=torch.float64)
-    motions[:, :3, :3] = same
-    motions[:, 3:, 3:] = torch.cat([same, shifted, turned], dim=-1)
-    basis, sizes, _ = torch.linalg.svd(motions.reshape(6 * num, 12), full_matrices=False)
+    of_shifts = torch.cat([same, even], dim=-1)
+    of_turns = torch.cat([same, even, followed, turned], dim=-1)
+    motions = torch.zeros(num, 6, 30, dtype=torch.float64)
+    motions[:, :3, :12], motions[:, 3:, 12:] = of_shifts, of_turns
+    basis, sizes, _ = torch.linalg.svd(motions.reshape(6 * num, 30), full_matrices=False)
     kept: Tensor = basis[:, sizes > DEPENDENT_BELOW * sizes.max()]
-    return kept.reshape(num, 6, -1).to(directions)
+    return kept.reshape(num, 6, -1).to(scene_from_camera)
 
 
 class CameraOptimizer(nn.Module):
@@ -91,10 +99,10 @@ class CameraOptimizer(nn.Module):
         self.common: Tensor
         self.register_buffer("common", torch.zeros(rows, 6, 0), persistent=False)
 
-    def keep_frame(self, directions: Tensor) -> None:
-        """From now on corrections have nothing of `common_motions`. directions: [N, 3]."""
+    def keep_frame(self, scene_from_camera: Tensor) -> None:
+        """From now on corrections have nothing of `common_motions`. Poses: [N, 3, 4]."""
         if self.mode != "off":
-            self.common = common_motions(directions).to(self.tangent)
+            self.common = common_motions(scene_from_camera).to(self.tangent)
 
     def corrections(self) -> Tensor:
         """[t, omega] [N, 6] as they are applied: of `tangent`, what cameras do not do together."""

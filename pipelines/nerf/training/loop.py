@@ -105,7 +105,7 @@ def train(
     fingerprint = _fingerprint(config, seed, posed, supervision)
     pixels_on = pixel_device(config, device, images.nbytes)
     state = initial_state(config, len(train_indices), seed, device, pixels_on)
-    state.model.cameras_delta.keep_frame(posed.scene_from_camera[:, :, 2])
+    state.model.cameras_delta.keep_frame(posed.scene_from_camera)
     if checkpoint_path is not None and checkpoint_path.exists():
         _resume(state, checkpoint_path, fingerprint)
     pixels_on = state.pixel_random.device
@@ -357,7 +357,8 @@ def _fingerprint(
         "cameras": _digest(cameras),
     }
     if config.model.camera_mode != "off":
-        run["keeps_frame"] = True  # earlier versions' models drifted with their cameras
+        # Earlier versions' models drifted with their cameras: all alike, later (True) evenly.
+        run["keeps_frame"] = "evenly"
     return json.dumps(run, sort_keys=True)
 
 

@@ -328,7 +328,7 @@ def _start(config: TrainConfig, device: torch.device, setting: Setting, engine: 
     build = find_method(config.method).build
     model: Model = build(config.model, NUM_IMAGES).to(device).train()
     cameras = _cameras(all_lenses=setting.all_lenses).to(device)
-    model.cameras_delta.keep_frame(cameras.scene_from_camera[:, :, 2])
+    model.cameras_delta.keep_frame(cameras.scene_from_camera)
     model.set_engine(engine)
     eps = config.optimizer.eps
     optimizers = {

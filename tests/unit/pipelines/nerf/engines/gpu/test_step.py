@@ -43,7 +43,7 @@ def toy_step(config: TrainConfig) -> tuple[Model, TrainingStep]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(SEED)
         model: Model = find_method(config.method).build(config.model, len(cameras)).train()
-    model.cameras_delta.keep_frame(cameras.scene_from_camera[:, :, 2])
+    model.cameras_delta.keep_frame(cameras.scene_from_camera)
     rates = config.optimizer
     step = TrainingStep(
         model,
