@@ -159,7 +159,9 @@ class OptimizerConfig:
     )
     camera_lr: float = option(1e-3, "Rate of the cameras at the start.", ge=1e-8, le=1.0)
     camera_lr_final: float = option(1e-4, "Rate of the cameras at the end.", ge=1e-9, le=1.0)
-    camera_decay_steps: int = option(5000, "Length of their decay.", unit="steps", ge=1, le=10**8)
+    camera_decay_steps: int = option(
+        5000, "Length of their decay; 0 for `max_steps`.", unit="steps", ge=0, le=10**8
+    )
     table_decay: float = option(
         0.0,
         "Times an entry of a hash grid's table, added to its gradient: what few rays tell anything "

@@ -44,11 +44,10 @@ def learning_rates(config: TrainConfig, step: int) -> dict[str, float]:
     """The rate of each optimiser, by its name."""
     rates = config.optimizer
     decay_steps = rates.decay_steps or config.max_steps
+    camera_steps = rates.camera_decay_steps or config.max_steps
     return {
         "networks": learning_rate(step, rates.lr, rates.lr_final, decay_steps, rates.decay),
-        "cameras": learning_rate(
-            step, rates.camera_lr, rates.camera_lr_final, rates.camera_decay_steps
-        ),
+        "cameras": learning_rate(step, rates.camera_lr, rates.camera_lr_final, camera_steps),
     }
 
 

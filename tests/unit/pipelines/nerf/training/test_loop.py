@@ -341,11 +341,20 @@ def test_learning_rate_decays_linearly_where_asked_and_cameras_as_they_do() -> N
 
 def test_a_decay_over_the_whole_run_ends_with_it() -> None:
     for max_steps in (40, 4000):
-        config = TrainConfig(
-            max_steps=max_steps, optimizer=OptimizerConfig(lr=0.1, lr_final=0.001, decay_steps=0)
+        rates = OptimizerConfig(
+            lr=0.1,
+            lr_final=0.001,
+            decay_steps=0,
+            camera_lr=1e-3,
+            camera_lr_final=1e-5,
+            camera_decay_steps=0,
         )
-        assert math.isclose(learning_rates(config, max_steps // 2)["networks"], 0.01)
-        assert math.isclose(learning_rates(config, max_steps)["networks"], 0.001)
+        config = TrainConfig(max_steps=max_steps, optimizer=rates)
+        half, end = (learning_rates(config, step) for step in (max_steps // 2, max_steps))
+        assert math.isclose(half["networks"], 0.01)
+        assert math.isclose(end["networks"], 0.001)
+        assert math.isclose(half["cameras"], 1e-4)
+        assert math.isclose(end["cameras"], 1e-5)
 
 
 def test_images_and_cameras_must_fit(images: ImageData, cameras: Cameras) -> None:
