@@ -94,7 +94,8 @@ def test_common_motions_are_orthonormal_and_as_many_as_there_are() -> None:
     row = _looking(torch.tensor([0.0, -2.0, 1.0])).expand(9, 3, 4).clone()
     in_one_place = row.clone()
     row[:, 0, 3] = torch.arange(9)  # side by side, all looking the same way
-    # Evenly in one direction alone, and turns about and across one axis are turns of all.
+    # In a row there is one direction to be even in, and whoever looks one way follows a scene by
+    # turns that are the same for all.
     for poses, num in ((_orbit(20), 30), (row, 12), (in_one_place, 6), (_orbit(4), 24)):
         motions = common_motions(poses).flatten(0, 1)
         assert motions.shape == (6 * len(poses), num)
@@ -177,12 +178,12 @@ def test_a_scene_that_is_shifted_is_not_followed() -> None:
 
 
 def test_a_camera_that_is_off_alone_is_corrected() -> None:
-    optimizer = CameraOptimizer(60, "so3xr3")
-    optimizer.keep_frame(_orbit(60))
+    optimizer = CameraOptimizer(40, "so3xr3")
+    optimizer.keep_frame(_orbit(40))
     with torch.no_grad():
         optimizer.tangent[7, 3:] = torch.tensor([0.01, 0.02, -0.01])
     found = optimizer.corrections()
-    assert torch.allclose(found[7, 3:], optimizer.tangent[7, 3:], rtol=0.4)
+    assert torch.allclose(found[7, 3:], optimizer.tangent[7, 3:], rtol=0.3)
     others = torch.cat([found[:7], found[8:]])
     assert others.norm(dim=-1).max() < 0.2 * found[7].norm()
 

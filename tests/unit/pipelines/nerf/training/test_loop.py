@@ -179,8 +179,10 @@ def test_a_checkpoint_of_another_run_is_refused(
     assert caught.value.code == "bad_checkpoint"
 
 
-@pytest.mark.parametrize("mode", ["so3xr3", "off"])
-@pytest.mark.parametrize("earlier", [{}, {"keeps_frame": True}])  # as earlier versions wrote it
+@pytest.mark.parametrize(
+    ("mode", "earlier"),  # as earlier versions wrote it
+    [("so3xr3", {}), ("so3xr3", {"keeps_frame": True}), ("off", {})],
+)
 def test_a_checkpoint_whose_cameras_may_have_drifted_together_is_refused(
     images: ImageData, cameras: Cameras, tmp_path: Path, mode: str, earlier: dict[str, bool]
 ) -> None:
