@@ -23,7 +23,7 @@ def _needs_a_browser() -> None:
     try:
         find_browser()
     except NoBrowserError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"what browsers show is NOT tested: {error}")
 
 
 def _square(textured: bool) -> TriangleMesh | TexturedMesh:
@@ -58,7 +58,7 @@ def test_three_js_shows_a_mesh_upright_in_its_colours(
     try:
         three_folder()
     except NoBrowserError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"what browsers show is NOT tested: {error}")
     path = tmp_path / "mesh.glb"
     write_mesh(path, _square(textured), style=style)
     shown = show(path, tmp_path, turns=1)
@@ -85,7 +85,7 @@ def test_three_js_shows_a_ktx2_texture_as_it_does_a_jpeg(tmp_path: Path) -> None
     try:
         three_folder()
     except NoBrowserError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"what browsers show is NOT tested: {error}")
     square = _square(textured=True)
     assert isinstance(square, TexturedMesh)
     pictures = []

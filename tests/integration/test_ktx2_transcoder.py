@@ -21,7 +21,7 @@ def _needs_three_js() -> None:
     try:
         three_folder()
     except NoBrowserError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"three.js's transcoder is NOT tested: {error}")
 
 
 def _every_kind() -> Bytes:

@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.captures, pytest.mark.slow]
 def captures() -> Path:
     folder = os.environ.get("NERFWORKS_CAPTURES")
     if not folder:
-        pytest.skip("NERFWORKS_CAPTURES does not name the folder of real captures")
+        pytest.skip("real captures are NOT tested: NERFWORKS_CAPTURES does not name their folder")
     return Path(folder)
 
 

@@ -170,7 +170,7 @@ def test_made_capture_looks_at_its_centre(tmp_path: Path) -> None:
 @pytest.mark.captures
 @pytest.mark.skipif(
     "NERFWORKS_CAPTURES" not in os.environ,
-    reason="NERFWORKS_CAPTURES does not name the folder of real captures",
+    reason="real captures are NOT tested: NERFWORKS_CAPTURES does not name their folder",
 )
 def test_fox_is_split_as_the_reference_split_it() -> None:
     folder = Path(os.environ["NERFWORKS_CAPTURES"]) / "photos-fox"

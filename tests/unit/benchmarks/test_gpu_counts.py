@@ -106,7 +106,10 @@ def test_devices_are_known_by_the_names_that_drivers_give() -> None:
     assert known_device("Radeon") is None
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU, so it would measure")
+@pytest.mark.skipif(
+    torch.cuda.is_available(),
+    reason="what it says without a GPU is NOT tested: there is one, so it would measure",
+)
 def test_without_a_gpu_the_benchmark_says_so_and_fails() -> None:
     command = [sys.executable, "-m", "tests.benchmarks.gpu_speed"]
     answer = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
