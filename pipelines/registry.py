@@ -133,9 +133,9 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="evaluate",
-        version=3,
+        version=4,
         after=("train",),
-        reads=("ingest", "frames", "train"),
+        reads=("ingest", "frames", "depth", "train"),
         run="pipelines.stages.evaluate:run",
         options="EvaluateOptions",
         needs_gpu=True,

@@ -1,11 +1,12 @@
 """The evaluate stage: pictures of the held-out views beside the truth, and how close they are.
 
-Reads `train/model.zip` and the images with their masks. Held-out views are rendered at the size
-that was trained on, with the capture's poses and the mean appearance code, or, where the options
-ask for it, with what the test-time procedure fitted (`pipelines.nerf.judging.test_time`); pixels
-that a mask leaves out are not measured. Where the capture's light drifts and training levelled it,
-each half of a picture has the light that the other half was measured to have. `protocol` says which
-of this was done. Writes `metrics.json` and `images/<name>.jpg`: truth | render | error.
+Reads `train/model.zip`, the images with their masks, and the maps of `depth` for how far cameras
+look. Held-out views are rendered at the size that was trained on, with the capture's poses and the
+mean appearance code, or, where the options ask for it, with what the test-time procedure fitted
+(`pipelines.nerf.judging.test_time`); pixels that a mask leaves out are not measured. Where the
+capture's light drifts and training levelled it, each half of a picture has the light that the other
+half was measured to have. `protocol` says which of this was done. Writes `metrics.json` and
+`images/<name>.jpg`: truth | render | error.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from pipelines.nerf.errors import NerfError
 from pipelines.nerf.judging.floaters import floater_measures, opacity_of_density
 from pipelines.nerf.judging.lpips import Lpips, lpips_if_configured
 from pipelines.nerf.judging.metrics import psnr, ssim
-from pipelines.nerf.judging.off_path import off_path_cameras
+from pipelines.nerf.judging.off_path import off_path_cameras, view_targets
 from pipelines.nerf.judging.protocol import protocol
 from pipelines.nerf.judging.test_time import (
     FittedCodes,
@@ -49,8 +50,10 @@ from pipelines.nerf.space.cameras import Cameras
 from pipelines.option_models import StageOptions
 from pipelines.options import evaluate_config
 from pipelines.scene.cameras_file import PosedImage
+from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.trained_scene import TrainedScene, as_uint8, nerf_cameras, nerf_errors_as
 from pipelines.stage import StageContext
+from pipelines.workspace import Workspace
 
 LPIPS_WEIGHTS, LPIPS_SHA256 = "NERFWORKS_LPIPS_WEIGHTS", "NERFWORKS_LPIPS_SHA256"
 """Environment: a file or URL, or several with commas between, and their sums."""
@@ -139,7 +142,7 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
             text = f"image {index + 1}/{len(views.posed)}"
             text += "" if shown is None else f", {shown:.1f} dB"
             meter.show("images", (index + 1) / len(views.posed), text)
-    floaters, no_floaters = _floaters(scene, config, ctx.seed, meter)
+    floaters, no_floaters = _floaters(scene, config, ctx, meter)
     metrics = {
         **summarise(rows),
         "lpips_reason": no_lpips,
@@ -341,7 +344,7 @@ def _lpips(config: EvaluateConfig, ctx: StageContext) -> tuple[Lpips | None, str
 
 
 def _floaters(
-    scene: TrainedScene, config: EvaluateConfig, seed: int, meter: _Meter
+    scene: TrainedScene, config: EvaluateConfig, ctx: StageContext, meter: _Meter
 ) -> tuple[dict[str, Any] | None, str | None]:
     """Both measures, or why there are none."""
     if not config.floaters:
@@ -364,10 +367,13 @@ def _floaters(
     try:
         cameras = nerf_cameras(lenses, [image.world_from_camera for image in posed], scene.scene)
         cameras = cameras.resized(config.floater_long_side_px)
+        depths = _median_depths(ctx.workspace, [image.file for image in posed])
+        targets = view_targets(cameras, None if depths is None else depths * scene.scene.scale)
         found = floater_measures(
             render_rays,
-            off_path_cameras(cameras, config.floater_views, seed),
+            off_path_cameras(cameras, targets, config.floater_views, ctx.seed),
             cameras.to(next(model.parameters()).device),
+            targets,
             opacity_of_density(density, near=model.config.near),
             scene.scene.scale,
         )
@@ -379,6 +385,19 @@ def _floaters(
         "near_mass": round(found.near_mass, 6),
         **found.details,
     }, None
+
+
+def _median_depths(workspace: Workspace, files: list[str]) -> Tensor | None:
+    """The median z-depth [N] of the maps of the stage `depth`, world units, NaN where nothing is
+    known; None where it made none.
+    """
+    if not workspace.is_complete("depth"):
+        return None
+    maps = DepthMapsFile(workspace.stage("depth"))
+    found = {item.file: known.z[known.z > 0] for item, known in maps}
+    rows = [found.get(file) for file in files]
+    medians = [np.nan if row is None or row.size == 0 else float(np.median(row)) for row in rows]
+    return torch.tensor(medians, dtype=torch.float64) if found else None
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:

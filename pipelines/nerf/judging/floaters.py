@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.judging.off_path import evenly, view_distances
+from pipelines.nerf.judging.off_path import Targets, evenly
 from pipelines.nerf.space.cameras import Cameras
 
 SURFACE_ACCUMULATION = 0.5
@@ -76,6 +76,7 @@ def floater_measures(
     render_rays: RenderRays,
     cameras_off_path: Cameras,
     training_cameras: Cameras,
+    targets: Targets,
     opacity_before: OpacityBefore,
     scene_scale: float,
 ) -> FloaterReport:
@@ -84,13 +85,13 @@ def floater_measures(
     render_rays, opacity_before: see the types; `opacity_of_density` makes the second from a
         density. Both get tensors on the cameras' device.
     cameras_off_path: V >= 2; each pixel gives one surface point, so that long sides of 64 px do.
+    targets: of the training cameras.
     scene_scale: scene units per world unit (`SceneTransform.scale`).
-    Raises NerfError `bad_cameras` for fewer than two off-path views or training cameras that all
-    stand in one place.
+    Raises NerfError `bad_cameras` for fewer than two off-path views.
     """
     depth_of = surface_depth(render_rays, scene_scale)
     seen_through, counted = inconsistent_points(cameras_off_path, depth_of)
-    distance = near_distance(training_cameras)
+    distance = near_distance(targets)
     picked = evenly(len(training_cameras), MAX_NEAR_CAMERAS)
     mass = near_mass(training_cameras.select(picked), opacity_before, distance)
     per_view = [
@@ -210,13 +211,13 @@ def opacity_of_density(
     return opacity_before
 
 
-def near_distance(cameras: Cameras) -> float:
+def near_distance(targets: Targets) -> float:
     """The depth of the space in front of the cameras that should be empty, scene units.
 
-    0.3 of the 10th percentile of `view_distances`: the closest cameras set it, as a walk towards
+    0.3 of the 10th percentile of how far they look: the closest cameras set it, as a walk towards
     the subject must not count the subject itself; a percentile, as one odd pose must not shrink it.
     """
-    return NEAR_SHARE * float(torch.quantile(view_distances(cameras), NEAR_QUANTILE))
+    return NEAR_SHARE * float(torch.quantile(targets.distances, NEAR_QUANTILE))
 
 
 def _surface_points(cameras: Cameras, index: int, depth_of: SurfaceDepth) -> tuple[Tensor, Tensor]:

@@ -1,13 +1,13 @@
 """Virtual cameras beside the path of a capture, and how far its cameras look.
 
-Everything follows from the training poses alone, so that no floater can move it. Lengths are scene
-units. Symbols: N cameras in the order of their path, c_i their centres, a_i their optical axes, F
-the focus.
+Everything follows from the training poses and from what was known of the capture's depth before
+anything was trained, so that no floater can move it. Lengths are scene units. Symbols: N cameras in
+the order of their path, c_i their centres, a_i their optical axes, F the focus.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from pipelines.nerf.space.cameras import Cameras
 OFF_PATH_SHARE = 0.15
 _NUM_WAYS = 32
 _MAX_ALONG_UP = 0.99
+_MAX_DEPTHS = 2.0
+"""A camera does not look at what is farther than so many times the depth that it shows."""
 _MIN_SPREAD = 1e-3
 """Least mean sin^2 of the angle between the optical axes and their common direction that gives a
 focus: below about 2 degrees they are as good as parallel."""
@@ -41,21 +43,39 @@ def focus_point(cameras: Cameras) -> Tensor | None:
     return focus if float(ahead.double().mean()) > 0.5 else None
 
 
-def view_distances(cameras: Cameras) -> Tensor:
-    """How far each camera looks: [N] float64, > 0, from poses alone, so that no floater moves it.
+@dataclass(frozen=True)
+class Targets:
+    """What each of N cameras looks at.
 
-    The distance to the focus, for cameras that have it ahead; for all others, and where there is
-    no focus, the root mean square distance of the cameras from their mean.
+    distances: [N] float64, > 0. points: [N, 3] float64: F, or what lies ahead at that distance.
+    """
+
+    distances: Tensor
+    points: Tensor
+
+
+def view_targets(cameras: Cameras, depths: Tensor | None = None) -> Targets:
+    """What each camera looks at, from poses and, where it is known, from the depth that it shows.
+
+    depths: [N], the median z-depth of each camera's picture, NaN where unknown: as the other
+    cameras' then, in the median.
+    A camera looks at the focus where its picture has that place, no farther than twice its depth.
+    All others, and where there is no focus, look straight ahead: at their depth, but no farther
+    than the root mean square distance of the cameras from their mean, which stands in where no
+    depth is known.
     Raises NerfError `bad_cameras` where all stand in one place and look nowhere in common.
     """
     centers, axes = _centers_and_axes(cameras)
+    known = _completed(depths, len(cameras))
     radius = (centers - centers.mean(dim=0)).square().sum(dim=-1).mean().sqrt()
-    distances = radius.expand(len(cameras))
+    distances = known.clamp_max(float(radius))
+    points = centers + distances[:, None] * axes
     focus = focus_point(cameras)
     if focus is not None:
-        toward = focus - centers
-        ahead = (toward * axes).sum(dim=-1) > 0.0
-        distances = torch.where(ahead, toward.norm(dim=-1), distances)
+        reach = (focus - centers).norm(dim=-1)
+        looks = _have_in_frame(cameras, focus) & (reach <= _MAX_DEPTHS * known)
+        distances = torch.where(looks, reach, distances)
+        points = torch.where(looks[:, None], focus, points)
     if not bool((distances > 1e-9).all()):
         raise NerfError(
             "bad_cameras",
@@ -63,25 +83,24 @@ def view_distances(cameras: Cameras) -> Tensor:
             "large the scene is.",
             "Turn the floater measures off for this capture.",
         )
-    return distances
+    return Targets(distances, points)
 
 
 def off_path_cameras(
-    cameras: Cameras, count: int, seed: int = 0, *, share: float = OFF_PATH_SHARE
+    cameras: Cameras, targets: Targets, count: int, seed: int = 0, *, share: float = OFF_PATH_SHARE
 ) -> Cameras:
     """`count` virtual cameras beside the path, with the lenses of cameras evenly picked from it.
 
-    Each is moved at right angles to its optical axis by `share` of its view distance, never down
-    (scene -Z), in that of 32 directions, turned by a random angle, which leads farthest from the
-    path: the lines from each camera to the next, straight on at both ends. Then it looks at the
-    focus, or where there is none, at the point that it looked at before.
+    Each is moved at right angles to its optical axis by `share` of the distance at which it looks,
+    never down (scene -Z), in that of 32 directions, turned by a random angle, which leads farthest
+    from the path: the lines from each camera to the next, straight on at both ends. Then it looks
+    at the point that it looked at before.
     Same arguments, same cameras.
     """
     if count < 1:
         raise NerfError("bad_cameras", "There must be at least one view off the path.")
     generator = torch.Generator().manual_seed(seed)
-    distances, focus = view_distances(cameras), focus_point(cameras)
-    centers, axes = _centers_and_axes(cameras)
+    centers, _ = _centers_and_axes(cameras)
     picked = evenly(len(cameras), count) if count <= len(cameras) else None
     rows = picked or [index * len(cameras) // count for index in range(count)]
     poses = []
@@ -92,10 +111,9 @@ def off_path_cameras(
         ways = torch.cos(angles)[:, None] * frame[:, 0] + torch.sin(angles)[:, None] * frame[:, 1]
         # Half of the circle is never below; the small term keeps both ends of a level line.
         ways = ways[ways[:, 2] >= -1e-9]
-        places = centers[row] + share * distances[row] * ways
+        places = centers[row] + share * targets.distances[row] * ways
         place = places[int(_distance_to_path(places, centers).argmax())]
-        target = focus if focus is not None else centers[row] + distances[row] * axes[row]
-        poses.append(_looking_at(place, target, frame))
+        poses.append(_looking_at(place, targets.points[row], frame))
     stacked = torch.stack(poses).to(cameras.scene_from_camera)
     return replace(cameras.select(rows), scene_from_camera=stacked)
 
@@ -104,6 +122,22 @@ def evenly(num: int, at_most: int) -> list[int]:
     """At most so many of the indices 0..num-1, evenly spaced with both ends."""
     places = np.linspace(0, num - 1, min(num, at_most)).round()
     return sorted({int(place) for place in places})
+
+
+def _have_in_frame(cameras: Cameras, place: Tensor) -> Tensor:
+    """Which cameras would show a place [3] if nothing stood before it: [N] bool, on the CPU."""
+    point = place[None].to(cameras.scene_from_camera)
+    shown = [len(cameras.points_in_frame(point, index)[0]) > 0 for index in range(len(cameras))]
+    return torch.tensor(shown)
+
+
+def _completed(depths: Tensor | None, num: int) -> Tensor:
+    """Depths [N] float64 on the CPU: unknown ones as the median of the others, infinite without."""
+    if depths is None:
+        return torch.full((num,), torch.inf, dtype=torch.float64)
+    found = depths.detach().cpu().double()
+    middle = torch.nanmedian(found).nan_to_num(torch.inf)
+    return torch.where(found.isnan(), middle, found)
 
 
 def _centers_and_axes(cameras: Cameras) -> tuple[Tensor, Tensor]:

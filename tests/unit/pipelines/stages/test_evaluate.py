@@ -208,6 +208,28 @@ def test_floaters_are_measured_unless_turned_off(job: Workspace) -> None:
     assert "evaluate.floaters" in metrics["floaters_reason"]
 
 
+def test_how_far_cameras_look_follows_the_depth_maps(job: Workspace) -> None:
+    """The sample's cameras look at a focus, unless maps are full of nearer things."""
+
+    def distance() -> float:
+        metrics = tiny_job.run(job, "evaluate", max_images=1)["summary"]
+        return float(metrics["floaters"]["near_distance_world"])
+
+    by_poses = distance()
+    tiny_job.run(job, "depth")
+    assert distance() == by_poses
+    medians = []
+    for path in sorted((job.stage("depth") / "maps").iterdir()):
+        with np.load(path) as held:
+            values = dict(held)
+        values["unit"] = 0.1 * values["unit"]
+        np.savez_compressed(path, **values)
+        z = values["z"].astype(np.float64) * float(values["unit"])
+        medians.append(np.median(z[z > 0]))
+    assert len(medians) == job.manifest("train")["summary"]["num_train"]
+    assert distance() == pytest.approx(0.3 * np.quantile(medians, 0.1), rel=1e-3)
+
+
 def _set_masks(job: Workspace, mask: np.ndarray) -> None:
     """Give every image of the trained job this mask, as a capture with masks would have."""
     folder = job.images_root / "masks"

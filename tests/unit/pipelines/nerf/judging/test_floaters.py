@@ -19,7 +19,7 @@ from pipelines.nerf.judging.floaters import (
     opacity_of_density,
     surface_depth,
 )
-from pipelines.nerf.judging.off_path import off_path_cameras
+from pipelines.nerf.judging.off_path import off_path_cameras, view_targets
 from pipelines.nerf.space.cameras import Cameras
 from tests.unit.pipelines.nerf.judging.floating_scene import (
     FOCAL,
@@ -46,11 +46,14 @@ def ring() -> Cameras:
 
 @pytest.fixture(scope="module")
 def off_path(ring: Cameras) -> Cameras:
-    return off_path_cameras(ring, 6, seed=0)
+    return off_path_cameras(ring, view_targets(ring), 6, seed=0)
 
 
 def measured(scene: Scene, views: Cameras, training: Cameras) -> FloaterReport:
-    return floater_measures(scene.render_rays, views, training, scene.opacity_before, SCENE.scale)
+    targets = view_targets(training)
+    return floater_measures(
+        scene.render_rays, views, training, targets, scene.opacity_before, SCENE.scale
+    )
 
 
 def expected_inconsistency(scene: Scene, views: Cameras, num_rays: int = 5000) -> float:
@@ -150,7 +153,7 @@ def test_solid_floaters_are_for_the_near_mass_to_find(ring: Cameras, off_path: C
     assert math.isclose(report.near_mass, disc_share(0.08, 0.45), rel_tol=0.05)
     for radius in (0.04, 0.16):
         solid = Scene(floaters=planted(radius), kappa=1e5)
-        mass = near_mass(ring, solid.opacity_before, near_distance(ring), lattice=64)
+        mass = near_mass(ring, solid.opacity_before, near_distance(view_targets(ring)), lattice=64)
         expected = disc_share(radius, 0.45)
         assert math.isclose(float(mass.mean()), expected, rel_tol=0.02)
 
@@ -238,7 +241,9 @@ def test_world_units_change_nothing_but_the_reported_distance(
         return Picture(picture.depth * np.float32(10.0), picture.accumulation)
 
     one = measured(scene, off_path, ring)
-    ten = floater_measures(tenfold, off_path, ring, scene.opacity_before, SCENE.scale / 10.0)
+    ten = floater_measures(
+        tenfold, off_path, ring, view_targets(ring), scene.opacity_before, SCENE.scale / 10.0
+    )
     assert ten.depth_inconsistency == pytest.approx(one.depth_inconsistency, rel=0.02)
     assert ten.near_mass == one.near_mass
     world = 0.3 * math.hypot(RING, RISE) / SCENE.scale
