@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=12,
+        version=13,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",

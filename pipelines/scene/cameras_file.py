@@ -53,6 +53,8 @@ class PosedImage:
     depth: path of the depth that a sensor measured (`pipelines.scene.sensor_depth`): npz with `z`,
         float32 [h, w], world units along the camera's axis, 0 = unknown. It covers the image at a
         resolution of its own, lens distortion included. Or None.
+    depth_lens: the lens by which that depth was written, where it is not the image's: then it
+        covers what that lens shows in a picture of the image's size. Or None.
     light: how brightly it was taken, where pictures were levelled: gains of red, green and blue
         over the capture's mean light, and the camera's bend (`pipelines.nerf.data.light`). Or None.
     """
@@ -64,6 +66,7 @@ class PosedImage:
     split: str | None = None
     mask: str | None = None
     depth: str | None = None
+    depth_lens: Intrinsics | None = None
     light: tuple[float, float, float, float] | None = None
 
 
@@ -98,6 +101,9 @@ class CamerasFile:
                     **image,
                     "world_from_camera": tuple(tuple(row) for row in image["world_from_camera"]),
                     "light": tuple(image["light"]) if image.get("light") else None,
+                    "depth_lens": Intrinsics(**image["depth_lens"])
+                    if image.get("depth_lens")
+                    else None,
                 }
             )
             for image in raw["images"]

@@ -113,7 +113,7 @@ def sensor_depth(
         return None
     z = load_sensor_depth(root / image.depth)
     height, width = z.shape
-    u, v = _image_pixels(lens, pinhole)
+    u, v = _image_pixels(image.depth_lens or lens, pinhole)
     return sampled(z, u * (width / lens.width) - 0.5, v * (height / lens.height) - 0.5)
 
 

@@ -25,12 +25,14 @@ from pipelines.scene.orientation import opengl_from_opencv
 from pipelines.sfm.agreement import LITTLE
 from pipelines.sfm.given_depth import Beside
 from pipelines.sfm.given_fit import Fit, fit_of
+from pipelines.sfm.given_lenses import LensTrial, objection, with_lenses
 from pipelines.sfm.given_pairs import overlapping_pairs, sampled_pairs
 from pipelines.sfm.given_refinement import Refined, refine
 from pipelines.sfm.given_scale import Scale, scaled, weighed
 from pipelines.sfm.pairs import Pairs
-from pipelines.sfm.tracks import Floats, build_tracks
+from pipelines.sfm.tracks import Floats, Observations, build_tracks
 from pipelines.tools.colmap import CameraGroup, FeatureSettings, Reconstructor
+from pipelines.tools.colmap_results import VerifiedMatches
 
 Mode = Literal["auto", "trust", "refine"]
 Verdict = Literal["trusted", "refined", "kept", "unverified"]
@@ -85,7 +87,8 @@ class Judged:
 
     sampled: the given poses' fit to a sample of pairs, None where too few match. before, after: of
     given and refined poses, by matches that were held out, where refinement got so far. refined:
-    its result, whether it was taken or not. why: in words. seconds: of all.
+    its result, whether it was taken or not. lens_trial: whether lenses were adjusted, too. why: in
+    words. seconds: of all.
     """
 
     mode: Mode
@@ -96,10 +99,16 @@ class Judged:
     before: Fit | None = None
     after: Fit | None = None
     refined: Refined | None = None
+    lens_trial: LensTrial | None = None
     depths: tuple[Beside, Beside] | None = None
     scale: Scale | None = None
     reading: str | None = None
     seconds: float = 0.0
+
+    @property
+    def depth_by_given_lens(self) -> bool:
+        """Whether the sensor's depth is what the lens shows that came along, not the new one."""
+        return self.depths is not None and self.depths[1].by_given_lens
 
     @property
     def fit(self) -> Fit | None:
@@ -235,20 +244,49 @@ class Judge:
             seed=self._seed,
             report=say,
         )
-        after = fit_of(refined.poses, posed.lenses, held, long_side_px)
+        after = fit_of(refined.poses, refined.lenses, held, long_side_px)
         judged = self._measured(replace(judged, before=before, after=after, refined=refined))
+        shown = 0.8, "adjusting the lens"
+        judged = self._with_lenses(judged, seen, held, lambda: report(*shown))
         against = self._objection(judged)
         if against is not None:
             return replace(judged, verdict="kept", why=f"{judged.why}; {against}")
-        assert after is not None
+        assert judged.after is not None
         assert judged.refined is not None
         return replace(
             judged,
             verdict="refined",
             poses=judged.refined.poses,
             why=f"matches that were set aside miss the given poses by {before.error_px:.2f} px, "
-            f"the refined ones by {after.error_px:.2f}",
+            f"the refined ones by {judged.after.error_px:.2f}",
         )
+
+    def _with_lenses(
+        self, judged: Judged, seen: Observations, held: VerifiedMatches, poll: Callable[[], None]
+    ) -> Judged:
+        """With lenses adjusted, too, where that is possible and nothing speaks against it."""
+        refined, long_side_px = judged.refined, self._settings.max_image_px
+        if judged.sampled is None or judged.before is None or judged.after is None:
+            return judged
+        assert refined is not None
+        found = with_lenses(
+            self._posed.poses,
+            refined,
+            seen,
+            error_px=max(judged.sampled.worst_px, judged.before.worst_px),
+            long_side_px=long_side_px,
+            run=self._reconstructor.runner(lambda _: poll()),
+            num_threads=self._num_threads,
+            report=lambda *_: poll(),
+        )
+        if found is None:
+            return judged
+        after = fit_of(found.poses, found.lenses, held, long_side_px)
+        tried = self._measured(replace(judged, after=after, refined=found))
+        was, now = (None if each.depths is None else each.depths[1] for each in (judged, tried))
+        against = objection(judged.after, after, (was, now), found)
+        trial = LensTrial(self._posed.lenses[0], found.lenses[0], against, after, now)
+        return replace(tried if against is None else judged, lens_trial=trial)
 
     def _measured(self, judged: Judged) -> Judged:
         """Refined poses at the scale that path and sensor say, and points beside the sensor's."""

@@ -9,13 +9,14 @@ directions that tell how far away it is.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from pipelines.scene.cameras_file import Intrinsics
+from pipelines.scene.registered_depth import rays_of, through
 from pipelines.scene.sensor_depth import Depths, load_sensor_depth
 from pipelines.sfm.given_refinement import Refined
 from pipelines.sfm.tracks import Floats, apart_deg
@@ -37,7 +38,8 @@ class Beside:
 
     ratio: how many times as far away as measured points are, the median. spread: the median
     deviation from that, as a share. depth: of the places, median, world units. num_images: in which
-    such places are.
+    such places are. by_given_lens: whether measured depth was taken to be what the lens shows that
+    came with the capture, where the image's is another by now.
     """
 
     ratio: float
@@ -45,30 +47,57 @@ class Beside:
     depth: float
     num_places: int
     num_images: int
+    by_given_lens: bool = False
 
 
 def points_beside(
-    found: Refined, lenses: Sequence[Intrinsics], depths: Sequence[Path | None]
+    found: Refined, given: Sequence[Intrinsics], depths: Sequence[Path | None]
 ) -> Beside | None:
     """What the sensor says of points; None where too few places have both.
 
-    depths: N, the maps of `pipelines.scene.sensor_depth`; those that cannot be read count as none.
+    given: N lenses, as they came. Where others fit by now, measured depth may be what either shows:
+    what agrees better is taken. depths: N, the maps of `pipelines.scene.sensor_depth`; those that
+    cannot be read count as none.
     """
+    as_pictured = _beside(found, found.seen.xy, depths)
+    if as_pictured is None or tuple(given) == found.lenses:
+        return as_pictured
+    by_given = _beside(found, _places_by(given, found), depths)
+    if by_given is None or by_given.spread >= as_pictured.spread:
+        return as_pictured
+    return replace(by_given, by_given_lens=True)
+
+
+def _places_by(given: Sequence[Intrinsics], found: Refined) -> Floats:
+    """Where the given lenses would show what is seen, [K, 2]."""
+    places = np.full((len(found.seen.track), 2), np.nan)
+    for image in np.unique(found.seen.image).tolist():
+        mine = found.seen.image == image
+        rays = rays_of(found.lenses[image], found.seen.xy[mine])
+        places[mine] = through(given[image], rays)
+    return places
+
+
+def _beside(found: Refined, places: Floats, depths: Sequence[Path | None]) -> Beside | None:
+    """The same with measured depth at these places of the pictures, [K, 2], pixels."""
     apart = apart_deg(found.seen, found.points, found.poses)
     logs, away, num_images = [], [], 0
     for image, path in enumerate(depths):
+        lens = found.lenses[image]
         mine = np.flatnonzero(found.seen.image == image)
         mine = mine[apart[found.seen.track[mine]] >= _APART_DEG]
+        inside = (places[mine] >= 0) & (places[mine] < (lens.width, lens.height))
+        mine = mine[inside.all(axis=1)]
         if path is None or not len(mine):
             continue
         try:
             measured = one_surface(load_sensor_depth(path))
         except ValueError:
             continue
-        pose, lens = found.poses[image], lenses[image]
+        pose = found.poses[image]
         z = (found.points[found.seen.track[mine]] - pose[:, 3]) @ pose[:, 2]
         height, width = measured.shape
-        there = between(measured, found.seen.xy[mine] * (width / lens.width, height / lens.height))
+        there = between(measured, places[mine] * (width / lens.width, height / lens.height))
         known = (there > 0) & (z > 0)
         logs.append(np.log(z[known] / there[known]))
         away.append(there[known])

@@ -7,7 +7,8 @@ onto its given poses as a whole. Images that see too little take part in the cor
 neighbours in the capture: what drifts drifts smoothly. Images whose given pose is wrong altogether,
 as of a row mixed up, are placed anew by the points that the others have found.
 
-Symbols: N images; poses [N, 3, 4] world_from_camera, OpenCV axes; lenses are not changed.
+Symbols: N images; poses [N, 3, 4] world_from_camera, OpenCV axes. Lenses are not changed here, but
+in `pipelines.sfm.given_lenses`.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ FEW_SEEN = 20
 """Observations of points that others see, too, below which an image says too little of its pose."""
 FEW_TOGETHER = 4
 """Images in a group below which it is not moved as a whole."""
-_PER_IMAGE = 400
+PER_IMAGE = 400
 """Observations of an image that are adjusted to, where it has more: time grows with them."""
 _QUICK = Rounds(iterations=8, rounds=2, tolerance=1e-4)
-_LAST = Rounds(iterations=10, rounds=4, tolerance=1e-6)
+LAST = Rounds(iterations=10, rounds=4, tolerance=1e-6)
 _OUTLYING = 3.0
-_WILD = 2.0
+WILD = 2.0
 _STRAY = 0.6
 SLACK = 3.0
 """How far off a pose may be, in what matches of the worse pairs miss it by at the distance of what
@@ -53,12 +54,13 @@ Report = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Refined:
-    """poses: [N, 3, 4]. is_seen: [N], whether its own matches say where an image is; others were
-    moved with them. is_anew: [N], whether it was placed without heed of its given pose. points:
-    [T, 3], and track_lengths: [T], how many images agree about each; 0 of none that is any good.
-    seen: observations of these. before: the same of the given poses."""
+    """poses: [N, 3, 4]. lenses: N, by which they fit. is_seen: [N], whether its own matches say
+    where an image is; others were moved with them. is_anew: [N], whether it was placed without heed
+    of its given pose. points: [T, 3], and track_lengths: [T], how many images agree about each; 0
+    of none that is any good. seen: observations of these. before: the same of the given poses."""
 
     poses: Floats
+    lenses: tuple[Intrinsics, ...]
     is_seen: Bools
     is_anew: Bools
     points: Floats
@@ -106,7 +108,7 @@ def refine(
             placed = resected(
                 lenses,
                 points,
-                _sightings(seen, on_points(seen, fits, lost)),
+                sightings(seen, on_points(seen, fits, lost)),
                 2 * loss_px * limit_px,
                 seed=seed,
                 run=run,
@@ -116,16 +118,16 @@ def refine(
             if placed:
                 points, fits = triangulate(seen, rays, poses, limit_px / scales)
             fits = shared(seen, fits & ~(lost & ~anew)[seen.image])
-        chosen = thinned(seen, fits, _PER_IMAGE)
+        chosen = thinned(seen, fits, PER_IMAGE)
         if before is None:
-            before = _as_found(given, points, fits, seen)
+            before = as_found(given, lenses, points, fits, seen)
         slack = SLACK * error_px * depth_of(seen, fits, points, poses) / float(np.median(scales))
-        ends = _LAST if turn == len(limits) - 1 else _QUICK
-        moved, _ = adjusted(
+        ends = LAST if turn == len(limits) - 1 else _QUICK
+        moved, _, _ = adjusted(
             poses,
             lenses,
             points,
-            _sightings(seen, chosen),
+            sightings(seen, chosen),
             ends,
             centers={i: given[i, :, 3] for i in range(num) if not anew[i]},
             slack=slack,
@@ -133,19 +135,24 @@ def refine(
             run=run,
             num_threads=num_threads,
         )
-        wild = (_WILD * slack, _WILD * SLACK * error_px / float(np.median(scales)))
+        wild = (WILD * slack, WILD * SLACK * error_px / float(np.median(scales)))
         poses, told = settled(given, moved, seen.where(chosen), anew, wild)
     points, fits = triangulate(seen, rays, poses, LAST_PX / scales)
     return replace(
-        _as_found(poses, points, fits, seen), is_seen=told, is_anew=anew & told, before=before
+        as_found(poses, lenses, points, fits, seen),
+        is_seen=told,
+        is_anew=anew & told,
+        before=before,
     )
 
 
-def _as_found(poses: Floats, points: Floats, fits: Bools, seen: Observations) -> Refined:
+def as_found(
+    poses: Floats, lenses: Sequence[Intrinsics], points: Floats, fits: Bools, seen: Observations
+) -> Refined:
     """Poses as they are, with the points that they give."""
     none = np.zeros(len(poses), bool)
     lengths = np.bincount(seen.track[fits], minlength=len(points)).astype(np.int64)
-    return Refined(poses, none, none, points, lengths, seen.where(fits))
+    return Refined(poses, tuple(lenses), none, none, points, lengths, seen.where(fits))
 
 
 def depth_of(seen: Observations, fits: Bools, points: Floats, poses: Floats) -> float:
@@ -190,7 +197,7 @@ def _count(seen: Observations) -> int:
     return int(seen.track.max()) + 1 if len(seen.track) else 0
 
 
-def _sightings(seen: Observations, which: Bools) -> Sightings:
+def sightings(seen: Observations, which: Bools) -> Sightings:
     return Sightings(seen.track[which], seen.image[which], seen.xy[which])
 
 

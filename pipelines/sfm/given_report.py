@@ -9,6 +9,7 @@ import numpy as np
 from pipelines.sfm.agreement import LITTLE
 from pipelines.sfm.given import Judged, Posed, movement, suspects
 from pipelines.sfm.given_fit import Fit
+from pipelines.sfm.given_lenses import TELLING, LensTrial
 from pipelines.sfm.given_scale import Scale
 
 DOUBTFUL_PX = 3.0
@@ -48,6 +49,7 @@ def given_report(judged: Judged, posed: Posed, long_side_px: int) -> dict[str, A
                 for name, beside in zip(("before", "after"), judged.depths, strict=True)
             },
             "scale": None if judged.scale is None else judged.scale.as_dict(),
+            "lens": None if judged.lens_trial is None else judged.lens_trial.as_dict(),
         }
     return found
 
@@ -73,6 +75,8 @@ def given_warnings(judged: Judged, posed: Posed) -> list[dict[str, Any]]:
     if fit.agreement < LITTLE or wrong:
         return [_contradicted(judged, fit, [posed.files[index] for index in wrong])]
     warnings = [] if judged.scale is None else _of_scale(judged.scale)
+    if judged.verdict == "refined" and judged.lens_trial is not None:
+        warnings += _of_lens(judged.lens_trial)
     if fit.error_px > DOUBTFUL_PX:
         warnings.append(
             {
@@ -97,6 +101,21 @@ def _of_scale(scale: Scale) -> list[dict[str, Any]]:
             "hint": "Measure something whose length you know, and scale what you export by that; a "
             "factor of about 1000 or 0.001 means that the depth was written in another unit.",
             "details": scale.as_dict(),
+        }
+    ]
+
+
+def _of_lens(trial: LensTrial) -> list[dict[str, Any]]:
+    if trial.refused is not None or abs(trial.zoom - 1.0) < TELLING:
+        return []
+    return [
+        {
+            "code": "given_lens_corrected",
+            "message": f"The lens that came with the capture does not fit its pictures: their "
+            f"focal length is {trial.zoom:.3f} times as long. It was corrected.",
+            "hint": "Nothing needs to be done. It may be that of another camera, such as the depth "
+            "sensor's, or of pictures of another size.",
+            "details": trial.as_dict(),
         }
     ]
 

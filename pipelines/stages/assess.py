@@ -44,9 +44,9 @@ from pipelines.nerf.data.light import in_the_light_of
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.space.cameras import Cameras, SceneTransform
 from pipelines.options import AssessOptions
-from pipelines.scene.cameras_file import CamerasFile, PosedImage
+from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsFile
-from pipelines.scene.sensor_depth import load_sensor_depth
+from pipelines.scene.registered_depth import registered_depth
 from pipelines.scene.trained_scene import nerf_cameras, nerf_errors_as
 from pipelines.stage import StageContext
 from pipelines.stages.evaluate import picture_name
@@ -63,12 +63,14 @@ _SAMPLES = 2
 class Views:
     """What assets are compared with: N photos at the size asked for, and their cameras.
 
-    cameras: in `frame`, the world less its origin. held_out: whether training never saw them.
+    lenses: of the photos as they are stored. cameras: in `frame`, the world less its origin.
+    held_out: whether training never saw them.
     bend: of the camera's curve, where assets have the mean light, which each photo differs from.
     void: [H, W] of each photo, where nothing stands; None in captures without sky and dark.
     """
 
     posed: list[PosedImage]
+    lenses: list[Intrinsics]
     images: ImageData
     cameras: Cameras
     frame: SceneTransform
@@ -172,7 +174,7 @@ def load_views(workspace: Workspace, options: AssessOptions) -> Views:
         lenses = [cameras.cameras[image.camera] for image in posed]
         sized = nerf_cameras(lenses, poses, frame).resized(options.long_side_px)
     void = void_masks(workspace, cameras, posed, sized)
-    return Views(posed, images, sized, frame, bool(held_out), cameras.bend, void)
+    return Views(posed, lenses, images, sized, frame, bool(held_out), cameras.bend, void)
 
 
 def describe(views: Views) -> dict[str, Any]:
@@ -304,9 +306,10 @@ def _against_sensor(
     found, truth = [], []
     for row in rows:
         shape = (seen[row].hit.shape[0], seen[row].hit.shape[1])
-        path = workspace.images_root / str(views.posed[row].depth)
+        image = views.posed[row]
         try:
-            depth = nearest(load_sensor_depth(path), shape)
+            stored = registered_depth(workspace.images_root, image, views.lenses[row])
+            depth = nearest(stored, shape)
         except ValueError as error:
             return None, f"The capture's depth was not compared: {error}"
         valid = views.valid(row)

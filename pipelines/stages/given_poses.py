@@ -133,12 +133,20 @@ def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext
                 shutil.copyfile(root / name, ctx.out / name)
         return
     poses = opengl_from_opencv(judged.poses)
+    lenses = list(cameras.cameras)
+    for image, lens in zip(cameras.images, refined.lenses, strict=True):
+        lenses[image.camera] = lens
     images = tuple(
-        replace(image, world_from_camera=tuple(tuple(map(float, row)) for row in pose))
-        for image, pose in zip(cameras.images, poses, strict=True)
+        replace(
+            image,
+            world_from_camera=tuple(tuple(map(float, row)) for row in pose),
+            depth_lens=given if image.depth and judged.depth_by_given_lens else None,
+        )
+        for image, given, pose in zip(cameras.images, posed.lenses, poses, strict=True)
     )
     notes = {**cameras.notes, "poses": "refined"}
-    replace(cameras, images=images, notes=notes).save(ctx.out / "cameras.json")
+    changed = replace(cameras, cameras=tuple(lenses), images=images, notes=notes)
+    changed.save(ctx.out / "cameras.json")
     apart = apart_deg(refined.seen, refined.points, refined.poses)
     kept = np.flatnonzero((refined.track_lengths >= MIN_TRACK) & (apart >= MIN_APART_DEG))
     if len(kept):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -47,9 +47,12 @@ def adjusted(
     loss_px: float,
     run: Run,
     num_threads: int,
-) -> tuple[Floats, Floats]:
-    """Poses [N, 3, 4] and points [T, 3] that fit what is seen; lenses stay as they are.
+    refine_lenses: bool = False,
+) -> tuple[Floats, Floats, list[Intrinsics]]:
+    """Poses [N, 3, 4], points [T, 3] and lenses [N] that fit what is seen.
 
+    Lenses stay as they are unless `refine_lenses` asks for focal lengths, k1, k2, p1 and p2 of
+    plain ones; images with equal lenses go on sharing one.
     Images that see nothing keep their poses, points that nobody sees their places. centers: where
     images are known to be, give or take `slack` (one standard deviation, world units, beside one of
     `loss_px`): they hold frame and scale, and whatever else the observations leave open. loss_px:
@@ -58,7 +61,7 @@ def adjusted(
     model = pycolmap.Reconstruction()
     ids = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), 1)}
     for lens, number in ids.items():
-        model.add_camera_with_trivial_rig(camera_of(lens, number))
+        model.add_camera_with_trivial_rig(camera_of(lens, number, distorted=refine_lenses))
     order = np.lexsort((seen.point, seen.image))
     tracks: dict[int, pycolmap.Track] = {}
     images, starts = np.unique(seen.image[order], return_index=True)
@@ -94,8 +97,8 @@ def adjusted(
         what="adjusting the poses",
         run=run,
         num_threads=num_threads,
-        refine_focal=False,
-        refine_distortion=False,
+        refine_focal=refine_lenses,
+        refine_distortion=refine_lenses,
         loss_px=loss_px,
         priors=priors,
     )
@@ -104,7 +107,19 @@ def adjusted(
         moved[image] = model.image(image + 1).cam_from_world().inverse().matrix()
     for point, point_id in stored.items():
         placed[point] = model.point3D(point_id).xyz
-    return moved, placed
+    found = {
+        lens: _plain_lens(lens, model.camera(number)) if refine_lenses else lens
+        for lens, number in ids.items()
+    }
+    return moved, placed, [found[lens] for lens in lenses]
+
+
+def _plain_lens(lens: Intrinsics, camera: pycolmap.Camera) -> Intrinsics:
+    """The lens with the values of COLMAP's OPENCV camera."""
+    fl_x, fl_y, cx, cy, k1, k2, p1, p2 = (float(value) for value in camera.params)
+    return replace(
+        lens, model="OPENCV", fl_x=fl_x, fl_y=fl_y, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2
+    )
 
 
 def resected(

@@ -19,8 +19,11 @@ def rays_through(lens: Intrinsics, places: Floats) -> Floats:
     return _rays(camera_of(lens), places)
 
 
-def camera_of(lens: Intrinsics, camera_id: int = 1) -> pycolmap.Camera:
-    """A lens of ours as COLMAP's simplest camera that can express it."""
+def camera_of(lens: Intrinsics, camera_id: int = 1, *, distorted: bool = False) -> pycolmap.Camera:
+    """A lens of ours as COLMAP's simplest camera that can express it.
+
+    distorted: for a plain lens one that can distort, whether it does or not.
+    """
     if lens.model == PANORAMA:
         size = (lens.width, lens.height)
         return pycolmap.Camera.create_from_model_name(camera_id, PANORAMA, 1.0, *size)
@@ -30,7 +33,7 @@ def camera_of(lens: Intrinsics, camera_id: int = 1) -> pycolmap.Camera:
     elif lens.k3:
         model = "FULL_OPENCV"
         params += [lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, 0.0, 0.0, 0.0]
-    elif any((lens.k1, lens.k2, lens.p1, lens.p2)):
+    elif distorted or any((lens.k1, lens.k2, lens.p1, lens.p2)):
         model = "OPENCV"
         params += [lens.k1, lens.k2, lens.p1, lens.p2]
     else:

@@ -20,6 +20,7 @@ from PIL import Image
 from pipelines.errors import ExportError
 from pipelines.exports.formats.archive import entry
 from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.registered_depth import registered_depth
 from pipelines.scene.sensor_depth import load_sensor_depth
 
 _CHUNK_BYTES = 1 << 20
@@ -86,10 +87,10 @@ def pack(
         if depth is not None and unit is not None:
             counts = np.zeros((lens.height, lens.width), np.uint16)
             if image.depth is not None:
-                z = load_sensor_depth(root / image.depth).astype(np.float64)
+                z = registered_depth(root, image, lens).astype(np.float64)
                 counts = np.clip(np.rint(z / unit), 0, _MOST_COUNTS).astype(np.uint16)
             _store_png(archive, depth, Image.fromarray(counts))
-        written.append(replace(image, mask=mask, depth=depth))
+        written.append(replace(image, mask=mask, depth=depth, depth_lens=None))
         on_image(index + 1)
     return Packed(
         cameras=replace(cameras, images=tuple(written)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,8 @@ def found(points: Floats, given: Floats | None = None) -> Refined:
     moved = factor * (points - TRUTH[0, :, 3]) @ turn.T + poses[0, :, 3]
     every, none = np.ones(NUM, bool), np.zeros(NUM, bool)
     seen = Observations(track, image, pixels[image, track])
-    return Refined(poses, every, none, moved, np.bincount(track, minlength=len(points)), seen)
+    lengths = np.bincount(track, minlength=len(points))
+    return Refined(poses, (LENS,) * NUM, every, none, moved, lengths, seen)
 
 
 def drifted(size: float, scale: float = 1.0) -> Floats:
@@ -181,10 +183,8 @@ def test_points_at_the_edges_of_things_are_not_compared_with_depths_that_nothing
 
 def test_points_that_were_seen_from_one_direction_only_say_nothing(tmp_path: Path) -> None:
     refined = found(places())
-    one_way = Refined(
-        np.concatenate([TRUTH[:, :, :3], np.tile(TRUTH[:1, :, 3:], (NUM, 1, 1))], axis=2),
-        *(refined.is_seen, refined.is_anew, refined.points, refined.track_lengths, refined.seen),
-    )
+    standing = np.tile(TRUTH[:1, :, 3:], (NUM, 1, 1))
+    one_way = replace(refined, poses=np.concatenate([TRUTH[:, :, :3], standing], axis=2))
     assert points_beside(one_way, [LENS] * NUM, maps(tmp_path)) is None
 
 

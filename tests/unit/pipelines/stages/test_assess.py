@@ -224,23 +224,27 @@ def test_floaters_that_were_not_measured_leave_coverage_to_judge(job: Workspace)
     assert assets["warnings"] == []
 
 
-def _with_depth(job: Workspace) -> None:
-    """Give every image exact depth."""
+def _with_depth(job: Workspace, zoom: float = 1.0) -> None:
+    """Give every image exact depth. zoom: of the lens by which it was written."""
     path = job.stage("train") / "cameras.json"
     cameras = CamerasFile.load(path)
     (job.images_root / "depth").mkdir()
     images = []
     for number, image in enumerate(cameras.images):
-        depth = depth_image(cameras.cameras[0], pose_matrix(image))
+        lens = cameras.cameras[0]
+        if zoom != 1.0:
+            lens = replace(lens, fl_x=zoom * lens.fl_x, fl_y=zoom * lens.fl_y)
+        depth = depth_image(lens, pose_matrix(image))
         file = f"depth/{number:05d}.npz"
         save_sensor_depth(job.images_root / file, depth.astype(np.float32))
-        images.append(replace(image, depth=file))
+        images.append(replace(image, depth=file, depth_lens=None if zoom == 1.0 else lens))
     replace(cameras, images=tuple(images)).save(path)
 
 
-def test_the_mesh_is_compared_with_the_captures_own_depth(job: Workspace) -> None:
+@pytest.mark.parametrize("zoom", [1.0, 1.15], ids=["by the picture's lens", "by another lens"])
+def test_the_mesh_is_compared_with_the_captures_own_depth(job: Workspace, zoom: float) -> None:
     _exact_assets(job)
-    _with_depth(job)
+    _with_depth(job, zoom)
     assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
     assert assets["depth_reason"] is None
     depth = assets["depth"]

@@ -55,22 +55,23 @@ def context(
     *,
     depth: float = 0.0,
     metric: bool = True,
+    focal: float = FOCAL,
+    depth_focal: float = FOCAL,
     **more: Any,
 ) -> StageContext:
     """A capture as `ingest` leaves it. depth: with a sensor's depth, of that scale. metric: whether
-    its poses are in metres."""
+    its poses are in metres. focal: what it says of its lens. depth_focal: of the depth's."""
     folder = Workspace(root).stage("ingest")
     (folder / "images").mkdir(parents=True)
     (folder / "depth").mkdir()
-    lens = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    lens = Intrinsics(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2)
     images = []
     for index, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
         file, depth_file = f"images/{index:05d}.jpg", f"depth/{index:05d}.npz"
         picture.save(folder / file, quality=95)
         if depth:
-            save_sensor_depth(
-                folder / depth_file, depth * true_depth(TRUTH[index]).astype(np.float32)
-            )
+            z = depth * true_depth(TRUTH[index], depth_focal)
+            save_sensor_depth(folder / depth_file, z.astype(np.float32))
         rows = tuple(tuple(float(value) for value in row) for row in pose)
         images.append(PosedImage(file, 0, rows, depth=depth_file if depth else None))
     CamerasFile((lens,), tuple(images), metric=metric, source="nerfstudio").save(
@@ -81,11 +82,11 @@ def context(
     return StageContext("poses", Workspace(root), out, Workspace(root).checkpoint("poses"), **more)
 
 
-def true_depth(pose: Poses) -> np.ndarray:
+def true_depth(pose: Poses, focal: float = FOCAL) -> np.ndarray:
     """[75, 100] of the room, along the camera's axis."""
     u, v = np.meshgrid((np.arange(100) + 0.5) * 4, (np.arange(75) + 0.5) * 4)
     local = np.stack(
-        [(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL, -np.ones_like(u)], axis=-1
+        [(u - WIDTH / 2) / focal, -(v - HEIGHT / 2) / focal, -np.ones_like(u)], axis=-1
     )
     rays = local @ pose[:, :3].T
     with np.errstate(divide="ignore"):
@@ -157,6 +158,9 @@ def test_drifted_poses_are_refined_towards_the_truth_at_their_own_place_and_scal
     # Drift made the path 2.4 % longer; the sensor knows better, and is heard.
     assert abs(similarity(TRUTH[:, :, 3], found(ctx)[:, :, 3]).scale - 1) < 0.005
     assert told["refinement"]["scale"]["believed"] == "path and sensor"
+    # The lens was right, and stays.
+    assert CamerasFile.load(ctx.out / "cameras.json").cameras[0].fl_x == FOCAL
+    assert told["refinement"]["lens"]["taken"] is False
     assert told["refinement"]["num_carried"] == 0
     assert told["refinement"]["replaced"] == []
     assert steps == sorted(steps)
@@ -164,6 +168,36 @@ def test_drifted_poses_are_refined_towards_the_truth_at_their_own_place_and_scal
     assert len({step for step in steps if step > 0.8}) > 5
     assert {0.18, 0.3, 0.8} <= {round(step, 3) for step in steps}
     assert (ctx.out / "points.ply").is_file()
+
+
+@pytest.mark.parametrize("by_sensor", [True, False], ids=["sensor's lens", "picture's lens"])
+def test_a_lens_of_another_camera_is_corrected_and_depth_stays_where_it_was_measured(
+    tmp_path: Path, pictures: list[Image.Image], by_sensor: bool
+) -> None:
+    """The lens that came along is 11 % too long: the depth sensor's, by which depth was written, or
+    just wrong, with depth that is registered to the pictures."""
+    wrong = 1.11 * FOCAL
+    more: dict[str, Any] = {"focal": wrong, "depth_focal": wrong if by_sensor else FOCAL}
+    ctx = context(tmp_path, drifted(), pictures, depth=1.0, **more)
+    summary = run(OPTIONS, ctx)
+    told = summary["given"]
+    assert told["verdict"] == "refined"
+    assert codes(summary) == ["given_lens_corrected"]
+    cameras = CamerasFile.load(ctx.out / "cameras.json")
+    (lens,) = cameras.cameras
+    assert lens.fl_x == pytest.approx(FOCAL, rel=0.015)
+    assert lens.fl_y == pytest.approx(FOCAL, rel=0.015)
+    for image in cameras.images:
+        assert (image.depth_lens is None) != by_sensor
+        assert image.depth_lens is None or image.depth_lens.fl_x == wrong
+    centers, turns = errors(found(ctx))
+    assert centers < 0.003
+    assert turns < 0.3
+    depth = told["refinement"]["sensor_depth"]
+    assert depth["after"]["spread"] < 0.006
+    assert depth["after"]["ratio"] == pytest.approx(1.0, abs=0.01)
+    assert told["refinement"]["lens"]["taken"]
+    assert told["refinement"]["lens"]["focal"] == pytest.approx(1 / 1.11, rel=0.015)
 
 
 @pytest.mark.parametrize(

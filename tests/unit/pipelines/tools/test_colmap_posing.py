@@ -17,7 +17,7 @@ SLACK = 0.05
 def worst_center(centers: Mapping[int, Floats]) -> float:
     """How far the worst centre ends from the truth, world units."""
     poses, points, seen = corridor()
-    moved, _ = adjusted(
+    moved, _, _ = adjusted(
         poses,
         [LENS] * NUM,
         points,

@@ -20,6 +20,7 @@ from pipelines.exports.formats.ply import read_ply, write_points
 from pipelines.exports.kinds.dataset import EXPORT, DatasetOptions
 from pipelines.exports.placement import to_world
 from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.registered_depth import registered_depth
 from pipelines.scene.sensor_depth import load_sensor_depth, save_sensor_depth
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
@@ -172,6 +173,32 @@ def test_all_that_a_capture_has_goes_out_and_comes_back(
     assert read["kind"] == "colmap"
     assert_same_cameras(ctx, cameras)
     np.testing.assert_allclose(read_ply(ctx.out / "points.ply").points, POINTS, atol=1e-6)
+
+
+def test_depth_by_another_lens_goes_out_as_the_pictures_have_it(
+    job: Workspace, tmp_path: Path
+) -> None:
+    cameras = enriched(job)
+    sensor = replace(cameras.cameras[0], fl_x=1.2 * cameras.cameras[0].fl_x)
+    images = tuple(
+        replace(image, depth_lens=sensor if image.depth else None) for image in cameras.images
+    )
+    by_sensor = replace(cameras, images=images)
+    _, files = exported(job, by_sensor)
+    _, ctx = ingest(tmp_path, files)
+    by_file = {image.file: image for image in by_sensor.images}
+    num_moved = 0
+    for image, source in zip(ingested(ctx).images, sources(ctx), strict=True):
+        original = by_file[source]
+        assert image.depth_lens is None
+        if original.depth is None:
+            continue
+        z = load_sensor_depth(ctx.out / str(image.depth))
+        wanted = registered_depth(job.images_root, original, cameras.cameras[original.camera])
+        np.testing.assert_allclose(z, wanted, atol=0.0005001)
+        stored = load_sensor_depth(job.images_root / original.depth)
+        num_moved += int(np.abs(wanted - stored).max() > 0.1)
+    assert num_moved == 19
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])
