@@ -269,16 +269,22 @@ class Judge:
         if judged.sampled is None or judged.before is None or judged.after is None:
             return judged
         assert refined is not None
-        found = with_lenses(
-            self._posed.poses,
-            refined,
-            seen,
-            error_px=max(judged.sampled.worst_px, judged.before.worst_px),
-            long_side_px=long_side_px,
-            run=self._reconstructor.runner(lambda _: poll()),
-            num_threads=self._num_threads,
-            report=lambda *_: poll(),
-        )
+        try:
+            found = with_lenses(
+                self._posed.poses,
+                refined,
+                seen,
+                error_px=max(judged.sampled.worst_px, judged.before.worst_px),
+                long_side_px=long_side_px,
+                run=self._reconstructor.runner(lambda _: poll()),
+                num_threads=self._num_threads,
+                report=lambda *_: poll(),
+            )
+        except Cancelled:
+            raise
+        except (OutOfTime, *_UNREFINED):
+            self._logger.warning("Adjusting the given lens broke off: it stays.", exc_info=True)
+            return judged
         if found is None:
             return judged
         after = fit_of(found.poses, found.lenses, held, long_side_px)

@@ -335,6 +335,25 @@ def test_a_refinement_that_breaks_off_leaves_the_given_poses_and_its_error_in_th
     assert told == ([broken] if is_logged else [])
 
 
+@pytest.mark.parametrize("broken", [ToolError("no"), ValueError("no"), given.OutOfTime()])
+def test_a_lens_that_cannot_be_adjusted_stays_and_poses_are_refined_all_the_same(
+    tmp_path: Path,
+    pictures: list[Image.Image],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    broken: Exception,
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise broken
+
+    monkeypatch.setattr(given, "with_lenses", fail)
+    ctx = context(tmp_path, drifted()[:FEW], pictures[:FEW])
+    told = run(OPTIONS, ctx)["given"]
+    assert told["verdict"] == "refined"
+    assert told["refinement"]["lens"] is None
+    assert [record.exc_info[1] for record in caplog.records if record.exc_info] == [broken]
+
+
 def test_a_capture_whose_features_cannot_be_found_goes_on(
     tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:
