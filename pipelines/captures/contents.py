@@ -33,7 +33,8 @@ class SensorDepth:
     """Depth that the phone measured beside a picture, along the camera's axis (z, not the ray).
 
     name: in the archive, a 16-bit PNG or an OpenEXR. It shows what the picture shows, at a
-    resolution of its own. unit: world units per stored value.
+    resolution of its own. unit: world units per stored value. lens: where another one than the
+    picture's shows it, that lens for a picture of the size it is called with.
     confidence: a picture of the same size, or None; where it is below `least_confidence`, the depth
     counts as unknown.
     """
@@ -42,6 +43,7 @@ class SensorDepth:
     unit: float
     confidence: str | None = None
     least_confidence: int = 0
+    lens: Callable[[int, int], Intrinsics] | None = None
 
     @property
     def files(self) -> list[str]:

@@ -35,7 +35,8 @@ _SLACK = 0.05
 
 @dataclass(frozen=True)
 class _Stored:
-    """A picture as written, with its camera. mask, depth: below the stage's folder, or None."""
+    """A picture as written, with its camera. mask, depth: below the stage's folder, or None.
+    depth_lens: as in `PosedImage`."""
 
     picture: Picture
     lens: Intrinsics
@@ -43,6 +44,7 @@ class _Stored:
     timestamp_s: float | None
     mask: str | None
     depth: str | None
+    depth_lens: Intrinsics | None
 
 
 def write_posed(
@@ -106,6 +108,7 @@ def write_posed(
             timestamp_s=item.timestamp_s,
             mask=item.mask,
             depth=item.depth,
+            depth_lens=item.depth_lens,
         )
         for item, pose in zip(stored, poses, strict=True)
     )
@@ -158,9 +161,11 @@ def _store(
     mask = None
     if source.mask is not None:
         mask = writer.store_mask(source.mask, number, size)
-    depth = None
+    depth, depth_lens = None, None
     if source.depth is not None:
         depth = depths.store(source.depth, number, size)
+        if depth is not None and source.depth.lens is not None:
+            depth_lens = checked_lens(source.depth.lens(*size), what)
     return _Stored(
         picture=picture,
         lens=lens,
@@ -168,6 +173,7 @@ def _store(
         timestamp_s=source.timestamp_s,
         mask=mask,
         depth=depth,
+        depth_lens=depth_lens,
     )
 
 

@@ -48,14 +48,16 @@ Lens = Callable[[int, int], Intrinsics]
 class RgbdCamera:
     """The camera of a folder.
 
-    lens: as in `PosedSource`. depth_unit: metres per count; None where depth shows another view
-    than the pictures, for the reason `why_no_depth`.
+    lens: as in `PosedSource`. depth_lens: that of its depth, where it is another. depth_unit:
+    metres per count; None where depth shows another view than the pictures, for the reason
+    `why_no_depth`.
     """
 
     lens: Lens
     depth_unit: float | None = _MILLIMETRE
     why_no_depth: str = ""
     warnings: tuple[str, ...] = ()
+    depth_lens: Lens | None = None
 
 
 @dataclass(frozen=True)
@@ -64,17 +66,18 @@ class _Published:
 
     name: str
     lens: Intrinsics
-    depth_unit: float | None
-    why_no_depth: str = ""
+    depth_unit: float
+    depth_lens: Intrinsics | None = None
 
 
 SEVEN_SCENES = _Published(
     "7-Scenes",
     Intrinsics(640, 480, 525.0, 525.0, 320.0, 240.0),
-    None,
-    "in 7-Scenes depth is another camera's (focal length 585), and not brought to the pictures'",
+    _MILLIMETRE,
+    Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0),
 )
-"""Source: the data set's page (depth, 585) and its public readers (colour, 525)."""
+"""Source: the data set's page (depth, 585) and its public readers (colour, 525). Both cameras stand
+2 cm apart, which is left out."""
 REPLICA = _Published("Replica", Intrinsics(1200, 680, 600.0, 600.0, 600.0, 340.0), 1.0 / 6553.5)
 """Source: cam_params.json, as NICE-SLAM publishes it beside the scenes: 599.5, 339.5."""
 REPLICA_SEMANTIC = _Published(
@@ -101,15 +104,17 @@ def read_camera(archive: CaptureArchive, root: str, published: _Published | None
             raise missing(
                 "There are no intrinsics beside the poses, as a file K.txt with the 3x3 matrix."
             )
+        own = published.depth_lens
+        of_depth = "" if own is None else f", that of depth {own.fl_x:g}"
         return RgbdCamera(
             partial(resized, published.lens),
             published.depth_unit,
-            published.why_no_depth,
-            (
+            warnings=(
                 "There are no intrinsics beside the poses; those published for "
                 f"{published.name} are taken: focal length {published.lens.fl_x:g} at "
-                f"{published.lens.width}x{published.lens.height}.",
+                f"{published.lens.width}x{published.lens.height}{of_depth}.",
             ),
+            depth_lens=None if own is None else partial(resized, own),
         )
     if file.endswith(".json"):
         return _of_json(archive, file)

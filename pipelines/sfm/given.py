@@ -108,7 +108,7 @@ class Judged:
     @property
     def depth_by_given_lens(self) -> bool:
         """Whether the sensor's depth is what the lens shows that came along, not the new one."""
-        return self.depths is not None and self.depths[1].by_given_lens
+        return self.depths is not None and self.depths[1].shown_by == "given"
 
     @property
     def fit(self) -> Fit | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
@@ -20,6 +21,8 @@ from pipelines.scene.registered_depth import rays_of, through
 from pipelines.scene.sensor_depth import Depths, load_sensor_depth
 from pipelines.sfm.given_refinement import Refined
 from pipelines.sfm.tracks import Floats, apart_deg
+
+ShownBy = Literal["picture", "given", "own"]
 
 FEWEST = 100
 """Places compared, for the result to mean anything."""
@@ -38,8 +41,8 @@ class Beside:
 
     ratio: how many times as far away as measured points are, the median. spread: the median
     deviation from that, as a share. depth: of the places, median, world units. num_images: in which
-    such places are. by_given_lens: whether measured depth was taken to be what the lens shows that
-    came with the capture, where the image's is another by now.
+    such places are. shown_by: which lens measured depth was taken to be seen through: the image's,
+    the one that came along with it, where that is another by now, or one of its own.
     """
 
     ratio: float
@@ -47,25 +50,33 @@ class Beside:
     depth: float
     num_places: int
     num_images: int
-    by_given_lens: bool = False
+    shown_by: ShownBy = "picture"
 
 
 def points_beside(
-    found: Refined, given: Sequence[Intrinsics], depths: Sequence[Path | None]
+    found: Refined,
+    given: Sequence[Intrinsics],
+    depths: Sequence[Path | None],
+    stated: Sequence[Intrinsics | None] = (),
 ) -> Beside | None:
     """What the sensor says of points; None where too few places have both.
 
     given: N lenses, as they came. Where others fit by now, measured depth may be what either shows:
     what agrees better is taken. depths: N, the maps of `pipelines.scene.sensor_depth`; those that
-    cannot be read count as none.
+    cannot be read count as none. stated: N lenses of these maps, where the capture tells them; None
+    for what its image's lens shows.
     """
+    if any(stated):
+        lenses = [own or lens for own, lens in zip(stated, found.lenses, strict=True)]
+        own_lens = _beside(found, _places_by(lenses, found), depths)
+        return own_lens and replace(own_lens, shown_by="own")
     as_pictured = _beside(found, found.seen.xy, depths)
     if as_pictured is None or tuple(given) == found.lenses:
         return as_pictured
     by_given = _beside(found, _places_by(given, found), depths)
     if by_given is None or by_given.spread >= as_pictured.spread:
         return as_pictured
-    return replace(by_given, by_given_lens=True)
+    return replace(by_given, shown_by="given")
 
 
 def _places_by(given: Sequence[Intrinsics], found: Refined) -> Floats:

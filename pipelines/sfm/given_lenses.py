@@ -87,7 +87,7 @@ class LensTrial:
             else {
                 "ratio": round(self.depth.ratio, 5),
                 "spread": round(self.depth.spread, 5),
-                "shown_by": "the given lens" if self.depth.by_given_lens else "the picture's lens",
+                "shown_by": self.depth.shown_by,
             },
         }
 

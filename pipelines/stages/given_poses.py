@@ -57,6 +57,7 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         is_metric=cameras.metric,
     )
     depths = [None if image.depth is None else root / image.depth for image in cameras.images]
+    stated = [image.depth_lens for image in cameras.images]
     with tempfile.TemporaryDirectory(prefix="poses-") as scratch:
         reconstructor = Reconstructor(
             Path(scratch) / "given.db",
@@ -67,7 +68,7 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         )
 
         def measured(found: Refined) -> Beside | None:
-            return points_beside(found, posed.lenses, depths)
+            return points_beside(found, posed.lenses, depths, stated)
 
         judge = Judge(
             posed,
@@ -140,7 +141,7 @@ def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext
         replace(
             image,
             world_from_camera=tuple(tuple(map(float, row)) for row in pose),
-            depth_lens=given if image.depth and judged.depth_by_given_lens else None,
+            depth_lens=given if image.depth and judged.depth_by_given_lens else image.depth_lens,
         )
         for image, given, pose in zip(cameras.images, posed.lenses, poses, strict=True)
     )

@@ -7,10 +7,11 @@
 
 A pose is a 4x4 matrix, world_from_camera, of an OpenCV camera; in a list a row each. Depth is
 counts along the camera's axis, millimetres where nothing says otherwise, and shows what the picture
-shows. World: metres; which way is up differs, so +Z is taken unless the pictures clearly say
-another axis. Rows of a list belong to pictures in an order that the pictures confirm
-(`pipelines.captures.pose_order`). A pose of which no number is finite is a frame that the camera
-had lost its way in (ScanNet). Intrinsics and published values: `pipelines.captures.rgbd_lenses`.
+shows, but in 7-Scenes, where it has a lens of its own. World: metres; which way is up differs, so
++Z is taken unless the pictures clearly say another axis. Rows of a list belong to pictures in an
+order that the pictures confirm (`pipelines.captures.pose_order`). A pose of which no number is
+finite is a frame that the camera had lost its way in (ScanNet). Intrinsics and published values:
+`pipelines.captures.rgbd_lenses`.
 """
 
 from __future__ import annotations
@@ -209,7 +210,8 @@ def _depths(
     except CaptureError as error:
         archive.told(maps)
         return {}, [f"{len(maps)} depth maps are not used. {error.message}"]
-    return {name: SensorDepth(file, unit) for name, file in both.items()}, []
+    lens = camera.depth_lens
+    return {name: SensorDepth(file, unit, lens=lens) for name, file in both.items()}, []
 
 
 def _by_files(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +58,12 @@ def context(
     metric: bool = True,
     focal: float = FOCAL,
     depth_focal: float = FOCAL,
+    is_stated: bool = False,
     **more: Any,
 ) -> StageContext:
     """A capture as `ingest` leaves it. depth: with a sensor's depth, of that scale. metric: whether
-    its poses are in metres. focal: what it says of its lens. depth_focal: of the depth's."""
+    its poses are in metres. focal: what it says of its lens. depth_focal: of the depth's, which it
+    says as well if `is_stated`."""
     folder = Workspace(root).stage("ingest")
     (folder / "images").mkdir(parents=True)
     (folder / "depth").mkdir()
@@ -73,7 +76,10 @@ def context(
             z = depth * true_depth(TRUTH[index], depth_focal)
             save_sensor_depth(folder / depth_file, z.astype(np.float32))
         rows = tuple(tuple(float(value) for value in row) for row in pose)
-        images.append(PosedImage(file, 0, rows, depth=depth_file if depth else None))
+        own = replace(lens, fl_x=depth_focal, fl_y=depth_focal) if is_stated else None
+        images.append(
+            PosedImage(file, 0, rows, depth=depth_file if depth else None, depth_lens=own)
+        )
     CamerasFile((lens,), tuple(images), metric=metric, source="nerfstudio").save(
         folder / "cameras.json"
     )
@@ -198,6 +204,25 @@ def test_a_lens_of_another_camera_is_corrected_and_depth_stays_where_it_was_meas
     assert depth["after"]["ratio"] == pytest.approx(1.0, abs=0.01)
     assert told["refinement"]["lens"]["taken"]
     assert told["refinement"]["lens"]["focal"] == pytest.approx(1 / 1.11, rel=0.015)
+
+
+@pytest.mark.parametrize("says", [FOCAL, 1.03 * FOCAL], ids=["right", "wrong"])
+def test_a_lens_that_is_stated_of_depth_stays_its_own(
+    tmp_path: Path, pictures: list[Image.Image], says: float
+) -> None:
+    """As in 7-Scenes: depth by a longer lens than the pictures'."""
+    sensor = 1.11 * FOCAL
+    more: dict[str, Any] = {"focal": says, "depth_focal": sensor, "is_stated": True}
+    ctx = context(tmp_path, drifted(), pictures, depth=1.0, **more)
+    told = run(OPTIONS, ctx)["given"]
+    assert told["verdict"] == "refined"
+    cameras = CamerasFile.load(ctx.out / "cameras.json")
+    assert cameras.cameras[0].fl_x == pytest.approx(FOCAL, rel=0.015)
+    assert {image.depth_lens.fl_x for image in cameras.images if image.depth_lens} == {sensor}
+    assert all(image.depth_lens for image in cameras.images)
+    after = told["refinement"]["sensor_depth"]["after"]
+    assert after["spread"] < 0.006
+    assert after["ratio"] == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize(

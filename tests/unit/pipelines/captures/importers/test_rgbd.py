@@ -197,15 +197,23 @@ def test_depth_of_another_view_is_not_used_and_told(tmp_path: Path) -> None:
     assert warning_with(summary, "4 pictures in depth/", "sees another view")
 
 
-def test_seven_scenes_has_the_published_lens_and_no_depth(tmp_path: Path) -> None:
+def test_seven_scenes_has_the_published_lenses_of_pictures_and_depth(tmp_path: Path) -> None:
     files = rgbd_files(4, "beside")
     del files["K.txt"]
     summary, ctx = ingest(tmp_path, files)
     (lens,) = cameras(ctx).cameras
     assert (lens.width, lens.fl_x, lens.cx) == (64, 52.5, 32.0)
-    assert summary["num_depths"] == 0
+    assert summary["num_depths"] == 4
+    for image in cameras(ctx).images:
+        assert image.depth_lens is not None
+        assert (image.depth_lens.width, image.depth_lens.fl_x) == (64, 58.5)
     assert warning_with(summary, "published for 7-Scenes", "525")
-    assert warning_with(summary, "4 pictures at the top", "another camera's")
+    assert warning_with(summary, "that of depth 585")
+
+
+def test_depth_that_the_pictures_lens_shows_names_no_other(tmp_path: Path) -> None:
+    _, ctx = ingest(tmp_path, rgbd_files(4, "beside"))
+    assert all(image.depth and image.depth_lens is None for image in cameras(ctx).images)
 
 
 def test_cam_params_tell_size_and_unit(tmp_path: Path) -> None:
