@@ -155,7 +155,9 @@ def judge_sensor(job: Workspace, capture: Path) -> tuple[dict[str, Any], Compare
     caster = MeshCaster(frame.scene_from_world(mesh.points), mesh.faces, None)
     compared = Compared()
     for row, image in enumerate(posed):
-        view = cameras_at(cameras.cameras[image.camera], poses[row : row + 1], frame)
+        # Through the lens that measured depth was seen through, whatever the picture's is by now.
+        lens = image.depth_lens or cameras.cameras[image.camera]
+        view = cameras_at(lens, poses[row : row + 1], frame)
         found = caster.view(view, 0)
         path = _depth_of(image, source, listed)
         assert path is not None
