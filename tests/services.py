@@ -32,7 +32,7 @@ def missing(what: str) -> None:
     """Skip, or fail where CI promises that everything is installed."""
     if os.environ.get("CI"):
         pytest.fail(f"{what} is missing: install the extra [test]")
-    pytest.skip(f"{what} is missing: install the extra [test]")
+    pytest.skip(f"what needs {what} is NOT tested: install the extra [test]")
 
 
 def free_port() -> int:

@@ -37,11 +37,16 @@ SECRET = "swordfish-7261"
 MIB = 2**20
 ROOT = Path(__file__).resolve().parents[3]
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux confines processes so")
-files_closed = pytest.mark.skipif(
-    landlock.version() < landlock.OLDEST, reason="needs a kernel with Landlock"
+linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="containment is NOT tested: only Linux has it"
 )
-signals_closed = pytest.mark.skipif(landlock.version() < 6, reason="needs Landlock 6")
+files_closed = pytest.mark.skipif(
+    landlock.version() < landlock.OLDEST,
+    reason="containment is NOT tested: this kernel has no Landlock",
+)
+signals_closed = pytest.mark.skipif(
+    landlock.version() < 6, reason="closed signals are NOT tested: no Landlock 6"
+)
 
 
 class Nosy:

@@ -97,7 +97,8 @@ class Kernel:
 """
 
 confined = pytest.mark.skipif(
-    landlock.version() < landlock.OLDEST, reason="needs a kernel with Landlock"
+    landlock.version() < landlock.OLDEST,
+    reason="containment is NOT tested: this kernel has no Landlock",
 )
 
 
@@ -273,7 +274,9 @@ def test_a_machine_without_a_compiler_uses_its_gpu_slowly_and_says_so(
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="a contained GPU is NOT tested: no CUDA device"
+)
 def test_a_contained_process_computes_on_this_machines_gpu_with_kernels_of_its_own(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

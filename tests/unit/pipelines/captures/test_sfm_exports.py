@@ -27,7 +27,7 @@ pytestmark = [
     pytest.mark.captures,
     pytest.mark.skipif(
         "NERFWORKS_CAPTURES" not in os.environ,
-        reason="NERFWORKS_CAPTURES does not name the folder of real captures",
+        reason="real captures are NOT tested: NERFWORKS_CAPTURES does not name their folder",
     ),
 ]
 

@@ -8,7 +8,9 @@ import torch
 from pipelines.nerf.devices import GPU_EXPECTED, choose_device
 from pipelines.nerf.errors import NerfError
 
-without_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+without_gpu = pytest.mark.skipif(
+    torch.cuda.is_available(), reason="no GPU is NOT tested: there is one"
+)
 
 
 @without_gpu

@@ -191,7 +191,7 @@ def test_an_unknown_engine_is_refused() -> None:
 @pytest.mark.gpu
 def test_a_model_on_a_gpu_shows_the_same_picture() -> None:
     if not torch.cuda.is_available():
-        pytest.skip("needs a CUDA device")
+        pytest.skip("pictures of a GPU are NOT tested: no CUDA device")
     cameras = two_cameras()
     on_cpu = Renderer(random_model(), SCENE, engine="plain").render(cameras, 1)
     on_gpu = Renderer(random_model(), SCENE, engine="plain", device="cuda").render(cameras, 1)

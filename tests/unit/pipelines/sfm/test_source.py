@@ -197,7 +197,7 @@ def test_the_frames_of_each_clip_are_a_lens_and_a_sequence_of_their_own(tmp_path
 @pytest.mark.captures
 @pytest.mark.skipif(
     "NERFWORKS_CAPTURES" not in os.environ,
-    reason="NERFWORKS_CAPTURES does not name the folder of real captures",
+    reason="real captures are NOT tested: NERFWORKS_CAPTURES does not name their folder",
 )
 def test_a_compact_cameras_photos_have_the_focal_length_colmap_reads(tmp_path: Path) -> None:
     folder = Path(os.environ["NERFWORKS_CAPTURES"]) / "photos-sceaux-castle" / "images"

@@ -35,7 +35,9 @@ def test_summary_says_what_was_trained(trained_job: Workspace) -> None:
     assert (summary["device"], summary["engine"], summary["warnings"]) == ("cpu", "fast", [])
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine whose GPU does not work")
+@pytest.mark.skipif(
+    torch.cuda.is_available(), reason="a GPU that does not work is NOT tested: this one does"
+)
 def test_a_gpu_that_trained_without_its_engine_is_told() -> None:
     config, gpu = TrainConfig(), torch.device("cuda")
     (warning,) = engine_warnings(config, gpu, "plain")

@@ -121,7 +121,9 @@ def test_the_k_th_usable_pixel_is_that_of_the_list_of_all_usable_pixels() -> Non
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="pixels on a GPU are NOT tested: no CUDA device"
+)
 def test_on_a_gpu_pixels_and_colours_are_those_of_the_images() -> None:
     random = np.random.default_rng(5)
     pictures = [random.integers(0, 256, (h, w, 3), np.uint8) for h, w in ((20, 33), (41, 5))]

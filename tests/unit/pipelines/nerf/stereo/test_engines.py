@@ -169,7 +169,9 @@ def test_a_gpu_that_cannot_is_left_for_the_kernels_and_that_is_told(
     assert caught.value.code == "gpu_failed"
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.skipif(
+    torch.cuda.is_available(), reason="stereo without a GPU is NOT tested: there is one"
+)
 def test_without_a_gpu_kernels_compute_and_asking_for_one_is_an_error() -> None:
     views, _ = row_of_cameras(2)
     assert choose_engine(views, StereoConfig()) is KERNELS
@@ -186,7 +188,9 @@ def test_more_planes_and_larger_pictures_want_more_memory() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="stereo on a GPU is NOT tested: no CUDA device"
+)
 def test_a_real_gpu_gives_the_values_of_the_kernels() -> None:
     assert engine_problem(torch.device("cuda")) is None
     assert disagreement(TorchEngine(torch.device("cuda")), KERNELS) is None

@@ -57,6 +57,8 @@ def test_interpreted_kernels_agree_with_the_plain_definitions() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="kernels on a GPU are NOT tested: no CUDA device"
+)
 def test_compiled_kernels_agree_with_the_plain_definitions() -> None:
     run_checks(interpreted=False)

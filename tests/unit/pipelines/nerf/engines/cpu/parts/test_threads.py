@@ -13,7 +13,9 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="threads are NOT tested: it looks into /proc"
+)
 
 _LIBRARIES = """
 import json, os, re, sys
