@@ -7,17 +7,16 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
 from pipelines.nerf.data.light import levelled
-from pipelines.nerf.space.lenses import CAMERA_MODELS, distort
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.depth_sampling import sampled
 from pipelines.scene.depth_views import Pinhole
+from pipelines.scene.lens_places import through
 from pipelines.scene.picture_sampling import at_grid, sampling_grid
 from pipelines.scene.sensor_depth import load_sensor_depth
 
@@ -165,16 +164,11 @@ def _terms(lens: Intrinsics) -> tuple[float, ...]:
     return (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2)
 
 
-@lru_cache(maxsize=1)  # most captures have one lens: its polynomial is solved once for all images
+@lru_cache(maxsize=2)  # most captures have one lens, or one for depth besides: solved once for all
 def _image_pixels(
     lens: Intrinsics, pinhole: Pinhole
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where in the stored image each of the pinhole's pixels is: u and v, [H, W] each, px."""
-    plane = pinhole.directions()[..., :2] * np.array([1.0, -1.0])
-    if _is_distorted(lens):
-        flat = torch.from_numpy(pinhole.directions() * np.array([1.0, -1.0, -1.0])).reshape(-1, 3)
-        model = CAMERA_MODELS.index(lens.model)
-        terms = torch.tensor([_terms(lens)], dtype=torch.float64).expand(len(flat), -1)
-        bent = distort(flat, terms, torch.full((len(flat),), model), (model,))
-        plane = bent.numpy().reshape(plane.shape)
-    return plane[..., 0] * lens.fl_x + lens.cx, plane[..., 1] * lens.fl_y + lens.cy
+    ways = pinhole.directions() * np.array([1.0, -1.0, -1.0])
+    places = through(lens, ways.reshape(-1, 3)).reshape(*ways.shape[:2], 2)
+    return places[..., 0], places[..., 1]

@@ -304,8 +304,11 @@ class Judge:
             middle = self._posed.poses[:, :, 3].mean(axis=0)
             judged = replace(judged, scale=scale, refined=scaled(refined, scale.factor, middle))
             now = now and replace(now, ratio=now.ratio * scale.factor)
-        was = None if refined.before is None else self._beside(refined.before)
-        return judged if was is None or now is None else replace(judged, depths=(was, now))
+        if judged.depths is not None:  # by another lens: the given poses' points are the same
+            was: Beside | None = judged.depths[0]
+        else:
+            was = None if refined.before is None else self._beside(refined.before)
+        return replace(judged, depths=None if was is None or now is None else (was, now))
 
     def _objection(self, judged: Judged) -> str | None:
         """What speaks against the refined poses, or None."""

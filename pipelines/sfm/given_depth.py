@@ -8,8 +8,8 @@ directions that tell how far away it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from pipelines.scene.cameras_file import Intrinsics
-from pipelines.scene.registered_depth import rays_of, through
+from pipelines.scene.lens_places import rays_of, through
 from pipelines.scene.sensor_depth import Depths, load_sensor_depth
 from pipelines.sfm.given_refinement import Refined
 from pipelines.sfm.tracks import Floats, apart_deg
@@ -68,15 +68,13 @@ def points_beside(
     """
     if any(stated):
         lenses = [own or lens for own, lens in zip(stated, found.lenses, strict=True)]
-        own_lens = _beside(found, _places_by(lenses, found), depths)
-        return own_lens and replace(own_lens, shown_by="own")
-    as_pictured = _beside(found, found.seen.xy, depths)
-    if as_pictured is None or tuple(given) == found.lenses:
-        return as_pictured
-    by_given = _beside(found, _places_by(given, found), depths)
-    if by_given is None or by_given.spread >= as_pictured.spread:
-        return as_pictured
-    return replace(by_given, shown_by="given")
+        ways: dict[ShownBy, Floats] = {"own": _places_by(lenses, found)}
+    else:
+        ways = {"picture": found.seen.xy}
+        if tuple(given) != found.lenses:
+            ways["given"] = _places_by(given, found)
+    told = [beside for beside in _beside(found, ways, depths) if beside is not None]
+    return min(told, key=lambda beside: beside.spread, default=None)
 
 
 def _places_by(given: Sequence[Intrinsics], found: Refined) -> Floats:
@@ -89,40 +87,49 @@ def _places_by(given: Sequence[Intrinsics], found: Refined) -> Floats:
     return places
 
 
-def _beside(found: Refined, places: Floats, depths: Sequence[Path | None]) -> Beside | None:
-    """The same with measured depth at these places of the pictures, [K, 2], pixels."""
+def _beside(
+    found: Refined, ways: Mapping[ShownBy, Floats], depths: Sequence[Path | None]
+) -> list[Beside | None]:
+    """Points beside depth, by each way to read it: the places of what is seen, [K, 2], pixels."""
     apart = apart_deg(found.seen, found.points, found.poses)
-    logs, away, num_images = [], [], 0
+    read: dict[ShownBy, list[tuple[Floats, Floats]]] = {shown_by: [] for shown_by in ways}
     for image, path in enumerate(depths):
-        lens = found.lenses[image]
         mine = np.flatnonzero(found.seen.image == image)
         mine = mine[apart[found.seen.track[mine]] >= _APART_DEG]
-        inside = (places[mine] >= 0) & (places[mine] < (lens.width, lens.height))
-        mine = mine[inside.all(axis=1)]
         if path is None or not len(mine):
             continue
         try:
             measured = one_surface(load_sensor_depth(path))
         except ValueError:
             continue
-        pose = found.poses[image]
+        pose, lens = found.poses[image], found.lenses[image]
         z = (found.points[found.seen.track[mine]] - pose[:, 3]) @ pose[:, 2]
         height, width = measured.shape
-        there = between(measured, places[mine] * (width / lens.width, height / lens.height))
-        known = (there > 0) & (z > 0)
-        logs.append(np.log(z[known] / there[known]))
-        away.append(there[known])
-        num_images += int(known.sum() >= _OF_IMAGE)
-    ratios = np.concatenate(logs) if logs else np.zeros(0)
-    if len(ratios) < FEWEST or num_images < FEWEST_IMAGES:
+        for shown_by, places in ways.items():
+            there = np.zeros(len(mine))
+            inside = ((places[mine] >= 0) & (places[mine] < (lens.width, lens.height))).all(axis=1)
+            scaled = places[mine[inside]] * (width / lens.width, height / lens.height)
+            there[inside] = between(measured, scaled)
+            known = (there > 0) & (z > 0)
+            read[shown_by].append((z[known], there[known]))
+    return [_told(shown_by, rows) for shown_by, rows in read.items()]
+
+
+def _told(shown_by: ShownBy, rows: Sequence[tuple[Floats, Floats]]) -> Beside | None:
+    """What depth of points and measured depth, image by image, say."""
+    num_images = sum(len(there) >= _OF_IMAGE for _, there in rows)
+    if sum(len(there) for _, there in rows) < FEWEST or num_images < FEWEST_IMAGES:
         return None
+    z, there = (np.concatenate(values) for values in zip(*rows, strict=True))
+    ratios = np.log(z / there)
     middle = float(np.median(ratios))
     return Beside(
         ratio=float(np.exp(middle)),
         spread=float(np.median(np.abs(ratios - middle))),
-        depth=float(np.median(np.concatenate(away))),
+        depth=float(np.median(there)),
         num_places=len(ratios),
         num_images=num_images,
+        shown_by=shown_by,
     )
 
 

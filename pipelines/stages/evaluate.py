@@ -393,11 +393,13 @@ def _median_depths(workspace: Workspace, files: list[str]) -> Tensor | None:
     """
     if not workspace.is_complete("depth"):
         return None
-    maps = DepthMapsFile(workspace.stage("depth"))
-    found = {item.file: known.z[known.z > 0] for item, known in maps}
-    rows = [found.get(file) for file in files]
-    medians = [np.nan if row is None or row.size == 0 else float(np.median(row)) for row in rows]
-    return torch.tensor(medians, dtype=torch.float64) if found else None
+    medians = {
+        item.file: float(np.median(found.z[found.z > 0]))
+        for item, found in DepthMapsFile(workspace.stage("depth"))
+        if found.z.any()
+    }
+    told = [medians.get(file, np.nan) for file in files]
+    return torch.tensor(told, dtype=torch.float64) if medians else None
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -10,7 +10,8 @@ import pytest
 
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.scene.depth_views import Pinhole
-from pipelines.scene.registered_depth import rays_of, registered_depth, through
+from pipelines.scene.lens_places import rays_of, through
+from pipelines.scene.registered_depth import registered_depth
 from pipelines.scene.sensor_depth import save_sensor_depth
 from pipelines.scene.stereo_views import sensor_depth
 
