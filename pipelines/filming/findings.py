@@ -8,7 +8,7 @@ where there is nothing but notes, `usable` with a moderate finding, `poor` with 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -91,6 +91,7 @@ def find(take: Take, thresholds: Thresholds | None = None) -> list[Finding]:
         *_smeared(take),
         *_parallax(take),
         *_given(take),
+        *_doubted(take),
         *_directions(take),
         *_exposure(take),
         *_light(take),
@@ -398,15 +399,24 @@ def _given(take: Take) -> list[Finding]:
     if take.given is None:
         return []
     return [
-        Finding(
-            warning["code"],
-            _OF_GIVEN.get(warning["code"], "note"),
-            warning["message"],
-            warning["hint"],
-            measured=dict(warning["details"]),
-        )
-        for warning in take.given["warnings"]
+        _told(warning, _OF_GIVEN.get(warning["code"], "note")) for warning in take.given["warnings"]
     ]
+
+
+def _doubted(take: Take) -> list[Finding]:
+    """Poses that were found, and that what pictures show contradicts as a whole."""
+    return [_told(warning, "severe") for warning in take.doubts]
+
+
+def _told(warning: Mapping[str, Any], severity: Severity) -> Finding:
+    """A warning of the stage `poses`, as a finding."""
+    return Finding(
+        warning["code"],
+        severity,
+        warning["message"],
+        warning["hint"],
+        measured=dict(warning["details"]),
+    )
 
 
 def _light(take: Take) -> list[Finding]:

@@ -73,6 +73,10 @@ class Clip:
     most_shared: int | None = None
 
 
+DOUBTS = ("path_torn", "poses_contradicted")
+"""Codes of warnings that a whole model of poses is doubted by."""
+
+
 @dataclass(frozen=True)
 class Take:
     """A capture as far as it is known.
@@ -82,8 +86,9 @@ class Take:
     `posed` (indices into shots). points: [P, 3], colors: [P, 3] uint8. angle_deg: the median angle
     between the directions that the same point is seen from. is_metric: whether a unit is a metre;
     None where nobody said. given: of poses that came along, how well they fit the pictures
-    (`pipelines.sfm.given_report`), with `warnings`. error: what ended the job, `{stage, code,
-    message, hint, details}`. clips: of a film in several, by their numbers; none of one in one.
+    (`pipelines.sfm.given_report`), with `warnings`. doubts: warnings that poses which were found
+    are wrong as a whole (`DOUBTS`). error: what ended the job, `{stage, code, message, hint,
+    details}`. clips: of a film in several, by their numbers; none of one in one.
     """
 
     kind: str = ""
@@ -98,6 +103,7 @@ class Take:
     angle_deg: float | None = None
     is_metric: bool | None = None
     given: Mapping[str, Any] | None = None
+    doubts: tuple[Mapping[str, Any], ...] = ()
     error: Mapping[str, Any] | None = None
     clips: tuple[Clip, ...] = ()
 
@@ -201,6 +207,9 @@ def _with_poses(take: Take, workspace: Workspace) -> Take:
             angle_deg=report.get("median_triangulation_angle_deg"),
             is_metric=report.get("metric"),
         )
+    if report is not None:
+        doubts = [one for one in report.get("warnings", []) if one["code"] in DOUBTS]
+        take = replace(take, doubts=tuple(doubts))
     if report is not None and "given" in report:
         take = replace(take, given={**report["given"], "warnings": report["warnings"]})
     if failed is not None:

@@ -125,6 +125,13 @@ def agreement_of_model(model: SparseModel, matches: Matches) -> float | None:
     return agreement(model.indices, model.world_from_camera, lenses, matches)
 
 
+def share_that_fits(model: SparseModel, matches: Matches) -> dict[tuple[int, int], float]:
+    """Of each pair of the model's images with enough matches, the share of them that fits."""
+    lenses = [model.cameras[number] for number in model.camera_of]
+    pairs = _of_pairs(model.indices, model.world_from_camera, lenses, matches)
+    return {pair.images: pair.share for pair in pairs}
+
+
 def contradicted_images(model: SparseModel, matches: Matches) -> tuple[int, ...]:
     """Those of a model's images, ascending, whose own matches say that they stand elsewhere.
 

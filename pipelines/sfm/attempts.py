@@ -45,11 +45,13 @@ from pipelines.sfm.retrieval import (
 )
 from pipelines.sfm.rungs import MAX_ALL_PAIRS, RUNGS, Matches, Rung, Standing
 from pipelines.sfm.source import Source, camera_groups
+from pipelines.sfm.tears import FilmOrder, impossible, tears
 from pipelines.sfm.turning import focal_of_turning, is_turning
 from pipelines.sfm.wide_lenses import probing_pairs, recognised
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import (
     FeatureSettings,
+    MapperSettings,
     Reconstructor,
     Watch,
     extraction_threads,
@@ -87,6 +89,8 @@ _LONG_ITEM_S, _SILENT_AFTER_S = 10.0, 60.0
 
 KEY_FRAMES = "key frames"
 """The matcher of a film that is mapped by some of its frames."""
+_ENOUGH_MENDED = 0.9
+"""Of what a torn model holds, the share that a mended one must hold to be taken for it."""
 _ENOUGH_KEYS = 0.5
 """Share of the key frames that a model must hold for the other frames to be placed on it."""
 
@@ -186,6 +190,18 @@ class ProgressScale:
             self.ctx.progress(self.fraction, f"{message} {done} of {total}", left)
 
         return report
+
+
+@dataclass(frozen=True)
+class _Mending:
+    """What mapping comes to, and with whose matches. torn: where the path of the best model is torn
+    all the same. left_out: pairs of images that matched and were not used, as they lay one side
+    over another."""
+
+    models: list[SparseModel]
+    reconstructor: Reconstructor
+    torn: tuple[tuple[int, int], ...] = ()
+    left_out: frozenset[tuple[int, int]] = frozenset()
 
 
 class Ladder:
@@ -420,6 +436,8 @@ class Ladder:
         counted = (len(keys), "placing key frame") if keys else (num, "placing image")
         watch = self._progress.watch((span[0], mapped), *counted)
         models = self._reconstructor.map(settings, watch, keys)
+        mending = self._mended(models, settings, watch, keys)
+        models = mending.models
         most = best_model(models)
         if keys and most is not None and len(most.indices) >= _ENOUGH_KEYS * len(keys):
             all_placed = mapped + _TIDIED * (placed - mapped)
@@ -427,7 +445,7 @@ class Ladder:
             steps = num_tidying_steps(num)
             tidied = self._progress.watch((all_placed, placed), steps, "tidying the model, step")
             models = [
-                self._reconstructor.place(model, settings, watch, tidied)
+                mending.reconstructor.place(model, settings, watch, tidied)
                 if model is most
                 else model
                 for model in models
@@ -436,10 +454,18 @@ class Ladder:
         compared(1)
         seen = self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES)
         compared(2)
+        seen = {pair: places for pair, places in seen.items() if pair not in mending.left_out}
         models = [self._believed(model, seen) for model in models]
         models = [replace(model, agreement=agreement_of_model(model, seen)) for model in models]
         compared(3)
-        attempt = Attempt(rung, matcher, tuple(models), time.monotonic() - began)
+        attempt = Attempt(
+            rung,
+            matcher,
+            tuple(models),
+            time.monotonic() - began,
+            mending.torn,
+            mending.left_out,
+        )
         self._attempts.append(attempt)
         self._ctx.logger.info(
             "%s attempt, %s matching: %d of %d images registered, models of %s that agree with %s "
@@ -451,6 +477,48 @@ class Ladder:
             [len(model.indices) for model in models],
             [None if model.agreement is None else round(model.agreement, 3) for model in models],
         )
+
+    def _mended(
+        self, models: list[SparseModel], settings: MapperSettings, watch: Watch, keys: list[int]
+    ) -> _Mending:
+        """The models, mapped anew without the pairs that lay one side over another where the path
+        is torn (`pipelines.sfm.tears`); as they are where it is not, or that fails.
+
+        Photos count as a film in the order that they come in: where they are in no order, hardly
+        any neighbours match, and nothing is said of a path.
+        """
+        whole = self._reconstructor
+        most = best_model(models)
+        if most is None:
+            return _Mending(models, whole)
+        clips: Sequence[Sequence[int]] = self._source.stretches
+        if keys:
+            places = clips_of_keys(keys, self._source.stretches)
+            clips = [keys[o.start : o.stop] for o in places]
+        order = FilmOrder.of(clips)
+        seen = whole.verified(None, MOST_MATCHES)
+        torn = tears(most, seen, order)
+        if not torn:
+            return _Mending(models, whole)
+        self._ctx.logger.info(
+            "the path is torn between images %s: mapping by what is near in time",
+            ", ".join(f"{i} and {j}" for i, j in torn),
+        )
+        enough = _ENOUGH_MENDED * len(most.indices)
+        far = frozenset(pair for pair in seen if order.is_far(pair))
+        along = whole.without_pairs(far)
+        path_models = along.map(settings, watch, keys)
+        path = best_model(path_models)
+        if path is None or len(path.indices) < enough or tears(path, seen, order):
+            return _Mending(models, whole, torn if self._source.is_video else ())
+        wrong = impossible(path, seen, far)
+        looped = whole.without_pairs(wrong)
+        looped_models = looped.map(settings, watch, keys)
+        found = best_model(looped_models)
+        self._ctx.logger.info("%d of %d pairs far in time are left out", len(wrong), len(far))
+        if found is None or len(found.indices) < enough or tears(found, seen, order):
+            return _Mending(path_models, along, left_out=far)
+        return _Mending(looped_models, looped, left_out=wrong)
 
     def _believed(self, model: SparseModel, seen: VerifiedMatches) -> SparseModel:
         """A model without the images that stand where their own matches say that they do not."""

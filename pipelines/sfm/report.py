@@ -45,12 +45,16 @@ _ADVICE = {
 
 @dataclass(frozen=True)
 class Attempt:
-    """One run of the mapper. matcher: which pairs. models: all it found, in COLMAP's order."""
+    """One run of the mapper. matcher: which pairs. models: all it found, in COLMAP's order. torn:
+    images of a film between which the best model's path is torn. left_out: pairs of images that
+    matched, and were not used as they would have torn it (`pipelines.sfm.tears`)."""
 
     rung: Rung
     matcher: str
     models: tuple[SparseModel, ...]
     seconds: float
+    torn: tuple[tuple[int, int], ...] = ()
+    left_out: frozenset[tuple[int, int]] = frozenset()
 
     @property
     def best(self) -> SparseModel | None:
@@ -59,14 +63,15 @@ class Attempt:
 
     @property
     def weight(self) -> float:
-        """What the best model counts against those of other attempts."""
-        return 0.0 if self.best is None else self.best.weight
+        """What the best model counts against those of other attempts: half where it is torn."""
+        return 0.0 if self.best is None else self.best.weight * (0.5 if self.torn else 1.0)
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether most of what pictures show speaks against the best model."""
+        """Whether most of what pictures show speaks against the best model, or what they show
+        next to each other in time does."""
         found = None if self.best is None else self.best.agreement
-        return found is not None and found < LITTLE
+        return bool(self.torn) or (found is not None and found < LITTLE)
 
     @property
     def num_registered(self) -> int:
@@ -241,6 +246,8 @@ def build_report(outcome: Outcome, source: Source) -> dict[str, Any]:
                 "num_registered": attempt.num_registered,
                 "model_sizes": [len(found.indices) for found in attempt.models],
                 "seconds": round(attempt.seconds, 2),
+                "torn": [[source.files[i] for i in pair] for pair in attempt.torn],
+                "pairs_left_out": len(attempt.left_out),
                 "chosen": attempt is chosen,
             }
             for attempt in outcome.attempts
@@ -291,6 +298,30 @@ def doubts_of(model: SparseModel) -> list[dict[str, Any]]:
             "hint": "Avoid mirrors and things that look the same from several sides, or film more "
             "of what stands around them.",
             "details": {"agreement": round(model.agreement, 4)},
+        }
+    ]
+
+
+def path_warnings(outcome: Outcome, source: Source) -> list[dict[str, Any]]:
+    """What is to be told of a film whose path is torn all the same."""
+    torn = outcome.chosen.torn
+    if not torn:
+        return []
+    files = [[source.files[i], source.files[j]] for i, j in torn]
+    seconds = [source.timestamps_s[i] for i, _ in torn]
+    places = [
+        file if second is None else f"{second:.1f} s"
+        for (file, _), second in zip(files, seconds, strict=True)
+    ]
+    return [
+        {
+            "code": "path_torn",
+            "message": f"The camera's path jumps after {', '.join(places)}, though what frames "
+            "before and behind show says that it did not: one side of the subject may lie over "
+            "another that looks the same.",
+            "hint": "Put something with a pattern beside the subject, like a newspaper under it, "
+            "and film slowly where its sides meet.",
+            "details": {"between": files},
         }
     ]
 

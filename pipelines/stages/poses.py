@@ -27,7 +27,13 @@ from pipelines.sfm.attempts import Checkpoint, Ladder, num_processors
 from pipelines.sfm.clips import clip_warnings, clips_of
 from pipelines.sfm.found_images import FoundImages, found_images
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled
-from pipelines.sfm.report import build_report, check_usable, report_of_failure, report_of_model
+from pipelines.sfm.report import (
+    build_report,
+    check_usable,
+    path_warnings,
+    report_of_failure,
+    report_of_model,
+)
 from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source, prior_focals_px, read_source
 from pipelines.sfm.subpixel import refine_model
@@ -105,9 +111,9 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         "clips": clips_of(outcome, source),
     }
     report["subpixel"] = refinement
-    apart = clip_warnings(report["clips"])
-    report["warnings"] = [*report["warnings"], *apart]
-    for warning in apart:
+    found_wrong = [*path_warnings(outcome, source), *clip_warnings(report["clips"])]
+    report["warnings"] = [*report["warnings"], *found_wrong]
+    for warning in found_wrong:
         ctx.logger.warning("%s", warning["message"])
     _write_report(ctx, report)
     ctx.progress(1.0, f"{len(model.indices)} of {len(source.files)} images registered", 0.0)

@@ -18,7 +18,9 @@ from __future__ import annotations
 
 import copy
 import os
+import shutil
 import tempfile
+import uuid
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
@@ -34,7 +36,7 @@ from pipelines.errors import ToolError
 from pipelines.tools.colmap_adjustment import Run
 from pipelines.tools.colmap_lenses import LensTrials
 from pipelines.tools.colmap_placing import num_tidying_steps, place_others
-from pipelines.tools.colmap_probing import MatchedPairs, set_lens, start_focal
+from pipelines.tools.colmap_probing import MatchedPairs, forget_pairs, set_lens, start_focal
 from pipelines.tools.colmap_results import (
     Correspondences,
     PairStatistics,
@@ -170,6 +172,14 @@ class Reconstructor:
         """The same images with another database."""
         other = copy.copy(self)
         other.database = database
+        return other
+
+    def without_pairs(self, pairs: Iterable[tuple[int, int]]) -> Reconstructor:
+        """The same images with a copy of the database, in the scratch folder, in which these pairs
+        never matched: to map by the others. Not while a call runs."""
+        other = self.on(self.scratch / f"without-{uuid.uuid4().hex}.db")
+        shutil.copyfile(self.database, other.database)
+        forget_pairs(other.database, self.names, pairs)
         return other
 
     def count_features(self, indices: Sequence[int], settings: FeatureSettings) -> list[int]:
@@ -394,8 +404,9 @@ class Reconstructor:
         """What extraction and matching put into the database. Not while another call runs."""
         return read_statistics(self.database, len(self.names))
 
-    def verified(self, most_pairs: int, most_matches: int) -> VerifiedMatches:
-        """Verified matches of some pairs, see `read_matches`. Not while another call runs."""
+    def verified(self, most_pairs: int | None, most_matches: int) -> VerifiedMatches:
+        """Verified matches of some pairs (None: of all), see `read_matches`. Not while another call
+        runs."""
         return read_matches(self.database, len(self.names), most_pairs, most_matches)
 
     def verified_of(self, pairs: Iterable[tuple[int, int]]) -> VerifiedMatches:

@@ -7,7 +7,7 @@ database, see `pipelines.tools.colmap`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +91,16 @@ def set_lens(
             pair = pycolmap.pair_id_to_image_pair(pair_id)
             if of_camera & set(pair):
                 opened.delete_two_view_geometry(*pair)
+
+
+def forget_pairs(database: Path, names: Sequence[str], pairs: Iterable[tuple[int, int]]) -> None:
+    """Take what was verified of these pairs of indices out of the database: mapping does not know
+    that they match."""
+    with pycolmap.Database.open(database) as opened:
+        for i, j in pairs:
+            ids = [_image(opened, names[index]).image_id for index in (i, j)]
+            if opened.exists_two_view_geometry(*ids):
+                opened.delete_two_view_geometry(*ids)
 
 
 def start_focal(

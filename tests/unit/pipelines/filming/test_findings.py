@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.filming.findings import CAPTURE_FAULTS, Thresholds, find, verdict_of
 from pipelines.filming.looks import Look
-from pipelines.filming.shots import Clip, Take
+from pipelines.filming.shots import DOUBTS, Clip, Take
 from tests.unit.pipelines.filming.takes import (
     NUM,
     SHARP,
@@ -191,6 +191,15 @@ def test_given_poses_that_the_pictures_contradict() -> None:
     assert verdict_of(given(), find(given()))[0] == "good"
     unknown = given("given_poses_unverified")
     assert verdict_of(unknown, find(unknown))[0] == "good"
+
+
+@pytest.mark.parametrize("code", DOUBTS)
+def test_poses_that_are_doubted_as_a_whole(code: str) -> None:
+    told = {"code": code, "message": "They are not.", "hint": "Look.", "details": {"share": 0.1}}
+    take = replace(good_take(), doubts=(told,))
+    (found,) = [one for one in find(take) if one.code == code]
+    assert (found.severity, found.advice) == ("severe", "Look.")
+    assert verdict_of(take, find(take))[0] == "poor"
 
 
 def test_few_pictures() -> None:

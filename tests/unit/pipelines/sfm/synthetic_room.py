@@ -12,7 +12,7 @@ WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 _TEXTURE_PER_UNIT = 120.0
 
 
-def _texture(seed: int) -> np.ndarray:
+def blobs(seed: int) -> np.ndarray:
     """[512, 512, 3] in [0, 255]: blobs of many sizes, which SIFT likes."""
     rng = np.random.default_rng(seed)
     total = np.zeros((512, 512, 3))
@@ -23,7 +23,7 @@ def _texture(seed: int) -> np.ndarray:
     return np.clip((total - low) / (high - low) * 255, 0, 255)
 
 
-_TEXTURES = [_texture(seed) for seed in range(3)]
+_TEXTURES = [blobs(seed) for seed in range(3)]
 
 
 def pose_looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -50,11 +50,11 @@ def render(pose: np.ndarray) -> Image.Image:
     for axis, texture in enumerate(_TEXTURES):
         here = wall == axis
         a, b = (hit[here][:, other] * _TEXTURE_PER_UNIT for other in range(3) if other != axis)
-        picture[here] = _bilinear(texture, a, b)
+        picture[here] = picked(texture, a, b)
     return Image.fromarray(picture.round().astype(np.uint8))
 
 
-def _bilinear(texture: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def picked(texture: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The texture, repeated by mirroring, at fractional positions."""
     size = len(texture) - 1
     a, b = (size - np.abs(values % (2 * size) - size) for values in (a, b))
