@@ -25,9 +25,10 @@ HOLE = 0.5
 MEASURES = {"coverage": 4, "psnr": 4, "ssim": 5, "psnr_with_holes": 4}
 """What is measured, and the decimals kept."""
 DEFINITIONS = (
-    "coverage: share of usable pixels where there is something; the sky and the dark are not "
-    "usable. psnr, ssim: on those pixels, against the photo; ssim with an 11x11 Gaussian window, "
-    "sigma 1.5, around covered pixels, holes within the window showing the photo. "
+    "coverage: share of usable pixels where there is something; the sky, the dark and the blank "
+    "ground of cut-out pictures are not usable. psnr, ssim: on those pixels, against the photo; "
+    "ssim with an 11x11 Gaussian window, sigma 1.5, around covered pixels, holes within the "
+    "window showing the photo. "
     "psnr_with_holes: on all usable pixels, holes mid grey. "
     "Means over views; a view without a covered pixel has no psnr and no ssim."
 )

@@ -66,7 +66,7 @@ class Views:
     lenses: of the photos as they are stored. cameras: in `frame`, the world less its origin.
     held_out: whether training never saw them.
     bend: of the camera's curve, where assets have the mean light, which each photo differs from.
-    void: [H, W] of each photo, where nothing stands; None in captures without sky and dark.
+    void: [H, W] of each photo, where nothing stands; None where depth found nothing of the kind.
     """
 
     posed: list[PosedImage]

@@ -28,6 +28,7 @@ from pipelines.nerf.data.light import Light
 from pipelines.nerf.judging.off_path import evenly
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, config_from_dict
+from pipelines.nerf.stereo.blank import find_blank
 from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.dark import find_dark
 from pipelines.nerf.stereo.engines import Engine, TorchEngine, choose_engine
@@ -152,7 +153,7 @@ class _Search:
     def all_passes(self) -> Found:
         """Maps of all images, and what is told of them."""
         passes: list[tuple[str, Callable[[], Found]]] = [("matched", self._matched)]
-        if self.config.find_sky or self.config.find_dark:
+        if self.config.find_blank or self.config.find_sky or self.config.find_dark:
             passes.append(("void", self._without_void))
         if self.config.complete_planes:
             passes.append(("planes", self._completed))
@@ -230,28 +231,39 @@ class _Search:
         maps, views = self.checkpoint.maps(), self.views
         on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _VOID_SHARE)
 
-        def third(begun: int, message: str) -> Callable[[float], None]:
-            return lambda share: on_progress((begun + share) / 3.0, message)
+        def quarter(begun: int, message: str) -> Callable[[float], None]:
+            return lambda share: on_progress((begun + share) / 4.0, message)
 
         sensed = None if self.source == "stereo" else self._sensed()
         told: dict[str, Any] = {}
         masks = [np.zeros(view.picture.shape, np.bool_) for view in views]
-        if self.config.find_sky:
+        if self.config.find_blank:
+            seen = views, self.color_picture, maps.z, sensed
+            blank = find_blank(*seen, quarter(0, "looking for a blank ground"))
+            told["blank"] = _rounded(blank.share, blank.num_views)
+            if blank.color is not None:
+                told["blank"]["color"] = list(blank.color)
+                masks = blank.masks
+        is_cut_out = told.get("blank", {}).get("share", 0.0) > 0.0
+        if self.config.find_sky and not is_cut_out:
             known = up_and_points(self.ctx.workspace, self.capture)
             given = views, self.color_picture, maps.z, *known, sensed, self.patches
-            sky = find_sky(*given, third(0, "looking for the sky"))
+            sky = find_sky(*given, quarter(1, "looking for the sky"))
             told["sky"] = {**_rounded(sky.share, sky.num_views), "far": round(sky.far, 3)}
             masks = sky.masks
         # By day what is black is an unlit side of something.
-        if self.config.find_dark and not told.get("sky", {}).get("share"):
-            seen = views, self.color_picture, maps.z, sensed, self.patches
-            dark = find_dark(*seen, third(1, "looking into the dark"))
+        is_day = bool(told.get("sky", {}).get("share"))
+        if self.config.find_dark and not is_day and not is_cut_out:
+            lit = views, self.color_picture, maps.z, sensed, self.patches
+            dark = find_dark(*lit, quarter(2, "looking into the dark"))
             told["dark"] = _rounded(dark.share, dark.num_views)
             masks = [one | other for one, other in zip(masks, dark.masks, strict=True)]
         if any(mask.any() for mask in masks):
-            on_share, shelves = third(2, "comparing what is nothing"), self.checkpoint.shelves
+            on_share, shelves = quarter(3, "comparing what is nothing"), self.checkpoint.shelves
             maps = without(masks, views, maps, self.config, on_share, self.engine, shelves)
-            self.ctx.logger.info("nothing stands where pictures show the sky or the dark: %s", told)
+            self.ctx.logger.info(
+                "nothing stands where pictures show no more than their ground: %s", told
+            )
         return maps, told
 
     def _see_nothing_there(self) -> None:

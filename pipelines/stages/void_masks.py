@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipelines.exports.formats.ply import read_ply
 from pipelines.nerf.data.depth_maps import DepthMaps
 from pipelines.nerf.space.cameras import Cameras
+from pipelines.nerf.stereo.blank import blank_of, like_blank
 from pipelines.nerf.stereo.dark import before_solid, like_dark, solid_points
 from pipelines.nerf.stereo.sky import like_sky
 from pipelines.nerf.stereo.views import StereoView
@@ -48,7 +49,7 @@ def void_masks(
     workspace: Workspace, capture: CamerasFile, images: Sequence[PosedImage], cameras: Cameras
 ) -> list[Bools] | None:
     """Where nothing stands in each image, [H, W] at its camera's size; None where `depth` found no
-    sky and no dark.
+    sky, no dark and no blank ground.
 
     capture: that the images are of. cameras: theirs, in their order.
     """
@@ -58,6 +59,7 @@ def void_masks(
     looks = _looks(workspace, capture, made["summary"])
     if not looks:
         return None
+    is_cut_out = bool(made["summary"].get("blank", {}).get("share"))
     side, root = made["options"]["long_side_px"], workspace.images_root
     found, lenses = [], []
     for image in images:
@@ -71,16 +73,28 @@ def void_masks(
         found.append(mask.astype(np.float32))
         lenses.append(view.lens)
     maps = DepthMaps.from_arrays(found, lenses, 1.0)
+    whole = DepthMaps.from_arrays([np.ones_like(mask) for mask in found], lenses, 1.0)
     masks = []
     for index, (width, height) in enumerate(cameras.size.tolist()):
-        asked = maps.distances(cameras.image_rays(index), cameras)
-        masks.append((asked > 0.0).numpy().reshape(height, width))
+        rays = cameras.image_rays(index)
+        mask = maps.distances(rays, cameras) > 0.0
+        if is_cut_out:
+            # The margin that a picture without distortion lacks.
+            mask |= whole.distances(rays, cameras) == 0.0
+        masks.append(mask.numpy().reshape(height, width))
     return masks
 
 
 def _looks(workspace: Workspace, capture: CamerasFile, told: dict[str, Any]) -> list[Look]:
     """How to tell each of the kinds of nothing that `depth` told of."""
     looks: list[Look] = []
+    blank = told.get("blank", {})
+    if blank.get("share"):
+        on_thing, (red, green, blue) = _solid_points(workspace, capture), blank["color"]
+        color = (red, green, blue)
+        looks.append(
+            lambda view, picture: blank_of(view, like_blank(view, picture, color), on_thing)
+        )
     if told.get("sky", {}).get("share"):
         known = up_and_points(workspace, capture)
         looks.append(lambda view, picture: like_sky(view, picture, *known))

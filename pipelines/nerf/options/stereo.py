@@ -54,6 +54,11 @@ class StereoConfig:
         "pictures, as before black cloth: it has no depth where no lit surface lies, and training "
         "lets light through there.",
     )
+    find_blank: bool = option(
+        True,
+        "Tell the blank ground of pictures that a thing was cut out of, of one colour or "
+        "transparent, from the thing: it has no depth, and training lets light through there.",
+    )
     complete_planes: bool = option(
         True,
         "Lay patches of even brightness on the planes that all views together show, where at least "

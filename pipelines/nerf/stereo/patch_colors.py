@@ -58,7 +58,7 @@ class PatchColors:
         # What stands before a patch frays into it: its colours are those of its inside, if any.
         told = inside | (there & (num_inside == 0)[labels])
         mean, spread = _colors_of(labels[told], picture[told], num)
-        touching = np.bincount(labels[there & _at_border(there)], minlength=num) > 0
+        touching = np.bincount(labels[there & at_border(there)], minlength=num) > 0
         is_large = touching & (area >= _LEAST_AREA * there.size)
         return cls(picture, labels, there, inside, mean, spread, area, num_inside, is_large)
 
@@ -108,7 +108,7 @@ def _colors_of(labels: Labels, colors: Bytes, num: int) -> tuple[Floats, Floats]
     return mean, np.sqrt(np.maximum(square - mean**2, 0.0)).max(axis=-1)
 
 
-def _at_border(there: Bools) -> Bools:
+def at_border(there: Bools) -> Bools:
     """[H, W]: what lies at the border of what a picture has."""
     padded = np.pad(there, _BORDER_PX)
     inner: Bools = shrunk(padded, _BORDER_PX)[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX]

@@ -1,4 +1,5 @@
-"""Where nothing stands: no depth, no hole, and training lets light through; sky and dark alike."""
+"""Where nothing stands: no depth, no hole, and training lets light through; in the sky, in the
+dark, and on the blank ground of cut-out pictures alike."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from pipelines.options import AssessOptions
 from pipelines.sample.scene import depth_image, pose_matrix
@@ -22,7 +24,8 @@ from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
 STEREO = {"long_side_px": 128, "num_planes": 64, "num_neighbours": 4}
-TAKES = {"sky": monument.TAKE, "dark": exhibit.TAKE}
+TAKES = {"sky": monument.TAKE, "dark": exhibit.TAKE, "blank": exhibit.TAKE}
+NOBODY_LOOKS = {"find_sky": False, "find_dark": False, "find_blank": False}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,11 +42,25 @@ class Filmed:
         return depth
 
 
+def filmed(root: Path, kind: str) -> Workspace:
+    """The capture; pictures of a cut-out thing are transparent around it, and laid on white."""
+    workspace = tiny_job.make_capture(root, 24, TAKES[kind], 128)
+    if kind == "blank":
+        folder = workspace.stage("ingest")
+        capture = CamerasFile.load(folder / "cameras.json")
+        for image in capture.images:
+            depth = depth_image(capture.cameras[0], pose_matrix(image), TAKES[kind].scene)
+            with Image.open(folder / image.file) as opened:
+                picture = np.where((depth == 0)[..., None], 255, np.asarray(opened))
+            Image.fromarray(picture.astype(np.uint8)).save(folder / image.file)
+    return workspace
+
+
 @pytest.fixture(scope="module", params=TAKES)
 def mapped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
-    """A figure in a square, under the sky; a ruin before black."""
+    """A figure in a square, under the sky; a ruin before black, and cut out of its pictures."""
     root, take = tmp_path_factory.mktemp(request.param) / "job", TAKES[request.param]
-    workspace = tiny_job.make_capture(root, 24, take, 128)
+    workspace = filmed(root, request.param)
     tiny_job.run(workspace, "depth", **STEREO)
     return Filmed(request.param, take, workspace)
 
@@ -72,8 +89,9 @@ def test_what_is_nothing_has_no_depth(mapped: Filmed) -> None:
     summary = mapped.workspace.manifest("depth")["summary"]
     for kind in TAKES:
         assert (summary.get(kind, {}).get("share", 0.0) > 0.2) == (kind == mapped.kind)
-    # By day nobody looks for the dark.
+    # By day nobody looks for the dark, and what was cut out has neither sky nor dark.
     assert ("dark" in summary) == (mapped.kind == "dark")
+    assert ("sky" in summary) == (mapped.kind != "blank")
     assert summary[mapped.kind]["num_views"] >= 20
     told, known, wrong = void_and_known(mapped)
     assert told > 0.8
@@ -82,9 +100,8 @@ def test_what_is_nothing_has_no_depth(mapped: Filmed) -> None:
 
 
 def test_unasked_it_is_filled_by_what_is_beside_it(mapped: Filmed, tmp_path: Path) -> None:
-    left = tiny_job.make_capture(tmp_path / "job", 24, mapped.take, 128)
-    options = STEREO | {"find_sky": False, "find_dark": False}
-    summary = tiny_job.run(left, "depth", **options)["summary"]
+    left = filmed(tmp_path / "job", mapped.kind)
+    summary = tiny_job.run(left, "depth", **STEREO, **NOBODY_LOOKS)["summary"]
     assert not set(TAKES) & set(summary)
     told, known, _ = void_and_known(dataclasses.replace(mapped, workspace=left))
     assert told == 0.0
