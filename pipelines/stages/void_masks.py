@@ -73,12 +73,14 @@ def void_masks(
         found.append(mask.astype(np.float32))
         lenses.append(view.lens)
     maps = DepthMaps.from_arrays(found, lenses, 1.0)
-    whole = DepthMaps.from_arrays([np.ones_like(mask) for mask in found], lenses, 1.0)
+    whole = None
+    if is_cut_out:
+        whole = DepthMaps.from_arrays([np.ones_like(mask) for mask in found], lenses, 1.0)
     masks = []
     for index, (width, height) in enumerate(cameras.size.tolist()):
         rays = cameras.image_rays(index)
         mask = maps.distances(rays, cameras) > 0.0
-        if is_cut_out:
+        if whole is not None:
             # The margin that a picture without distortion lacks.
             mask |= whole.distances(rays, cameras) == 0.0
         masks.append(mask.numpy().reshape(height, width))
