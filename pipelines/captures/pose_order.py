@@ -27,8 +27,9 @@ from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.natural_order import natural_key
 from pipelines.scene.nearness import apart
 from pipelines.stage import StageContext
-from pipelines.tools.colmap import CameraGroup, FeatureSettings, Reconstructor
+from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import read_matches
+from pipelines.tools.colmap_settings import CameraGroup, FeatureSettings
 
 Floats = npt.NDArray[np.float64]
 Pair = tuple[int, int]

@@ -1,20 +1,16 @@
-"""Climbing the ladder of attempts at a reconstruction, with its progress and its checkpoint.
+"""Climbing the ladder of attempts at a reconstruction.
 
 `pipelines.sfm.rungs` says which attempts there are: first the quick way (docs/poses.md has what was
 measured), then more thorough ones where too few images register. The attempt with most images wins.
-The databases, with features and matches, are the checkpoint.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 
 from pipelines.options import PosesOptions
 from pipelines.scene.panoramas import MODEL as PANORAMA
@@ -24,6 +20,7 @@ from pipelines.sfm.agreement import (
     agreement_of_model,
     contradicted_images,
 )
+from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.intrinsics import AUTO, FISHEYE, mapping_lens
 from pipelines.sfm.key_frames import (
     clips_of_keys,
@@ -34,7 +31,9 @@ from pipelines.sfm.key_frames import (
     missing_keys,
     placing_pairs,
 )
+from pipelines.sfm.mending import mended
 from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
+from pipelines.sfm.progress import ProgressScale, Span
 from pipelines.sfm.report import Attempt, Outcome, check_features
 from pipelines.sfm.retrieval import (
     FEATURES_PER_IMAGE,
@@ -45,17 +44,10 @@ from pipelines.sfm.retrieval import (
 )
 from pipelines.sfm.rungs import MAX_ALL_PAIRS, RUNGS, Matches, Rung, Standing
 from pipelines.sfm.source import Source, camera_groups
-from pipelines.sfm.tears import FilmOrder, impossible, tears
 from pipelines.sfm.turning import focal_of_turning, is_turning
 from pipelines.sfm.wide_lenses import probing_pairs, recognised
 from pipelines.stage import StageContext
-from pipelines.tools.colmap import (
-    FeatureSettings,
-    MapperSettings,
-    Reconstructor,
-    Watch,
-    extraction_threads,
-)
+from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_placing import num_tidying_steps
 from pipelines.tools.colmap_results import (
     PairStatistics,
@@ -64,6 +56,7 @@ from pipelines.tools.colmap_results import (
     best_model,
     without_images,
 )
+from pipelines.tools.colmap_settings import FeatureSettings, extraction_threads
 
 NUM_PROBES = 5
 """Images, spread over the capture, whose features are counted before the rest."""
@@ -73,10 +66,7 @@ ENOUGH_FEATURES = 500
 PANORAMA_FACTOR = 2
 """Panoramas are looked at so many times as large as other images, for so many more features."""
 
-_FORMAT = 5
-"""Of the checkpoint: raised where the same options give other databases or names of steps."""
 
-Span = tuple[float, float]
 _FIRST, _LAST = 0.9, 0.97
 """Where in the stage's progress the first rung ends, and the last."""
 _FOUND, _MATCHED = 0.28, 0.56
@@ -84,124 +74,11 @@ _FOUND, _MATCHED = 0.28, 0.56
 _CHOSEN, _MAPPED, _TIDIED, _PLACED = 0.05, 0.4, 0.8, 0.96
 """Where between those two key frames are chosen, where in the rest they are mapped, where between
 that and the fourth all images are placed, and where in the rest the model is complete."""
-_LONG_ITEM_S, _SILENT_AFTER_S = 10.0, 60.0
-"""After which one item counts as half done while its end is not known, and as no more done."""
 
 KEY_FRAMES = "key frames"
 """The matcher of a film that is mapped by some of its frames."""
-_ENOUGH_MENDED = 0.9
-"""Of what a torn model holds, the share that a mended one must hold to be taken for it."""
 _ENOUGH_KEYS = 0.5
 """Share of the key frames that a model must hold for the other frames to be placed on it."""
-
-
-class Checkpoint:
-    """The databases, and which steps are complete in them: a retried attempt goes on from there.
-
-    Databases without a state file, or made from other inputs or options, are thrown away.
-    """
-
-    def __init__(self, ctx: StageContext, source: Source, options: PosesOptions) -> None:
-        self._ctx = ctx
-        self._state_file = ctx.checkpoint / "state.json"
-        inputs = [
-            (file, path.stat().st_size)
-            for file, path in zip(source.files, source.paths, strict=True)
-        ]
-        wanted = options.model_dump(
-            include={"max_image_px", "num_features", "upsample", "camera_model", "matcher"}
-            | {"sequential_overlap", "retrieval_neighbours"}
-        )
-        text = json.dumps([_FORMAT, inputs, wanted, ctx.seed], sort_keys=True)
-        self._fingerprint = hashlib.sha256(text.encode()).hexdigest()
-        self._steps: list[str] = []
-        ctx.checkpoint.mkdir(parents=True, exist_ok=True)
-        if self._state_file.is_file():
-            state = json.loads(self._state_file.read_text("utf-8"))
-            here = all(self.database(step.split()[0]).is_file() for step in state["steps"])
-            if here and state["fingerprint"] == self._fingerprint:
-                self._steps = list(state["steps"])
-        if not self._steps:
-            self._state_file.unlink(missing_ok=True)
-            for stale in list(ctx.checkpoint.glob("*.db*")):
-                stale.unlink()
-
-    def database(self, name: str) -> Path:
-        """Where the database of that name lies, or will."""
-        return self._ctx.checkpoint / f"{name}.db"
-
-    def has(self, step: str) -> bool:
-        """Whether that step is complete in its database."""
-        return step in self._steps
-
-    def save(self, step: str) -> None:
-        """Mark a step complete and offer the checkpoint to the runner."""
-        self._steps.append(step)
-        state = {"fingerprint": self._fingerprint, "steps": self._steps}
-        partial = self._state_file.with_suffix(".partial")
-        partial.write_text(json.dumps(state), "utf-8")
-        partial.replace(self._state_file)
-        self._ctx.checkpoint_saved()
-
-
-@dataclass
-class ProgressScale:
-    """Turns counts within a step into the stage's progress, never backwards, with time left."""
-
-    ctx: StageContext
-    fraction: float = 0.0
-    goal: float = 1.0
-    anchor: tuple[float, float] = field(default_factory=lambda: (time.monotonic(), 0.0))
-    expected_end: float | None = None
-
-    def aim(self, start: float, goal: float) -> None:
-        """From now on, time left is counted to `goal`, at the speed since now."""
-        self.fraction = max(self.fraction, start)
-        self.anchor = (time.monotonic(), self.fraction)
-        self.goal = goal
-        self.expected_end = None
-
-    def watch(self, span: Span, total: int, message: str) -> Watch:
-        """A watch that maps 0..total onto `span`.
-
-        While one item takes long, it goes on by a part of that one, always more and never all;
-        after a minute it stands still, so that who looks for stages that hang sees it.
-        """
-        start, end = span
-        last, since = -1, 0.0
-
-        def report(done: int) -> None:
-            nonlocal last, since
-            done = min(done, total)
-            now = time.monotonic()
-            is_next = done != last
-            if is_next:
-                last, since = done, now
-            waited = min(now - since, _SILENT_AFTER_S)
-            part = waited / (waited + _LONG_ITEM_S)
-            fraction = start + (end - start) * min(done + part, total) / max(total, 1)
-            if fraction > self.fraction:
-                self.fraction = fraction
-                if is_next:  # a part of one is a guess, which says nothing of the pace
-                    began, first = self.anchor
-                    pace = (now - began) / (fraction - first)
-                    self.expected_end = now + pace * max(self.goal - fraction, 0.0)
-            left = None if self.expected_end is None else max(self.expected_end - now, 0.0)
-            self.ctx.progress(self.fraction, f"{message} {done} of {total}", left)
-
-        return report
-
-
-@dataclass(frozen=True)
-class _Mending:
-    """What mapping comes to, and with whose matches. torn: where the path of the best model is torn
-    all the same. left_out: pairs of images that matched and were not used, as they lay one side
-    over another."""
-
-    models: list[SparseModel]
-    reconstructor: Reconstructor
-    torn: tuple[tuple[int, int], ...] = ()
-    left_out: frozenset[tuple[int, int]] = frozenset()
 
 
 class Ladder:
@@ -435,17 +312,22 @@ class Ladder:
         mapped = span[0] + _MAPPED * (span[1] - span[0]) if keys else placed
         counted = (len(keys), "placing key frame") if keys else (num, "placing image")
         watch = self._progress.watch((span[0], mapped), *counted)
-        models = self._reconstructor.map(settings, watch, keys)
-        mending = self._mended(models, settings, watch, keys)
-        models = mending.models
+        mapping = mended(
+            self._reconstructor,
+            lambda reconstructor: reconstructor.map(settings, watch, keys),
+            self._clips(keys),
+            is_film=self._source.is_video,
+            logger=self._ctx.logger,
+        )
+        models = mapping.models
         most = best_model(models)
         if keys and most is not None and len(most.indices) >= _ENOUGH_KEYS * len(keys):
             all_placed = mapped + _TIDIED * (placed - mapped)
-            watch = self._progress.watch((mapped, all_placed), num, "placing image")
+            placing = self._progress.watch((mapped, all_placed), num, "placing image")
             steps = num_tidying_steps(num)
             tidied = self._progress.watch((all_placed, placed), steps, "tidying the model, step")
             models = [
-                mending.reconstructor.place(model, settings, watch, tidied)
+                mapping.reconstructor.place(model, settings, placing, tidied)
                 if model is most
                 else model
                 for model in models
@@ -454,7 +336,7 @@ class Ladder:
         compared(1)
         seen = self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES)
         compared(2)
-        seen = {pair: places for pair, places in seen.items() if pair not in mending.left_out}
+        seen = {pair: places for pair, places in seen.items() if pair not in mapping.left_out}
         models = [self._believed(model, seen) for model in models]
         models = [replace(model, agreement=agreement_of_model(model, seen)) for model in models]
         compared(3)
@@ -463,8 +345,8 @@ class Ladder:
             matcher,
             tuple(models),
             time.monotonic() - began,
-            mending.torn,
-            mending.left_out,
+            mapping.torn,
+            mapping.left_out,
         )
         self._attempts.append(attempt)
         self._ctx.logger.info(
@@ -478,47 +360,12 @@ class Ladder:
             [None if model.agreement is None else round(model.agreement, 3) for model in models],
         )
 
-    def _mended(
-        self, models: list[SparseModel], settings: MapperSettings, watch: Watch, keys: list[int]
-    ) -> _Mending:
-        """The models, mapped anew without the pairs that lay one side over another where the path
-        is torn (`pipelines.sfm.tears`); as they are where it is not, or that fails.
-
-        Photos count as a film in the order that they come in: where they are in no order, hardly
-        any neighbours match, and nothing is said of a path.
-        """
-        whole = self._reconstructor
-        most = best_model(models)
-        if most is None:
-            return _Mending(models, whole)
-        clips: Sequence[Sequence[int]] = self._source.stretches
-        if keys:
-            places = clips_of_keys(keys, self._source.stretches)
-            clips = [keys[o.start : o.stop] for o in places]
-        order = FilmOrder.of(clips)
-        seen = whole.verified(None, MOST_MATCHES)
-        torn = tears(most, seen, order)
-        if not torn:
-            return _Mending(models, whole)
-        self._ctx.logger.info(
-            "the path is torn between images %s: mapping by what is near in time",
-            ", ".join(f"{i} and {j}" for i, j in torn),
-        )
-        enough = _ENOUGH_MENDED * len(most.indices)
-        far = frozenset(pair for pair in seen if order.is_far(pair))
-        along = whole.without_pairs(far)
-        path_models = along.map(settings, watch, keys)
-        path = best_model(path_models)
-        if path is None or len(path.indices) < enough or tears(path, seen, order):
-            return _Mending(models, whole, torn if self._source.is_video else ())
-        wrong = impossible(path, seen, far)
-        looped = whole.without_pairs(wrong)
-        looped_models = looped.map(settings, watch, keys)
-        found = best_model(looped_models)
-        self._ctx.logger.info("%d of %d pairs far in time are left out", len(wrong), len(far))
-        if found is None or len(found.indices) < enough or tears(found, seen, order):
-            return _Mending(path_models, along, left_out=far)
-        return _Mending(looped_models, looped, left_out=wrong)
+    def _clips(self, keys: list[int]) -> Sequence[Sequence[int]]:
+        """The images that are mapped, in order of time, by clip."""
+        clips = self._source.stretches
+        if not keys:
+            return clips
+        return [keys[own.start : own.stop] for own in clips_of_keys(keys, clips)]
 
     def _believed(self, model: SparseModel, seen: VerifiedMatches) -> SparseModel:
         """A model without the images that stand where their own matches say that they do not."""

@@ -31,8 +31,9 @@ from pipelines.sfm.given_refinement import Refined, refine
 from pipelines.sfm.given_scale import Scale, scaled, weighed
 from pipelines.sfm.pairs import Pairs
 from pipelines.sfm.tracks import Floats, Observations, build_tracks
-from pipelines.tools.colmap import CameraGroup, FeatureSettings, Reconstructor
+from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import VerifiedMatches
+from pipelines.tools.colmap_settings import CameraGroup, FeatureSettings
 
 Mode = Literal["auto", "trust", "refine"]
 Verdict = Literal["trusted", "refined", "kept", "unverified"]

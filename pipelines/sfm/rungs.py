@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pipelines.sfm.key_frames import LONG_FILM
-from pipelines.tools.colmap import MapperSettings, Thresholds
+from pipelines.tools.colmap_settings import MapperSettings, Thresholds
 
 MAX_ALL_PAIRS = 300
 """Images beyond which `all_pairs` is not done: it would take hours."""

@@ -16,8 +16,8 @@ from PIL import Image, UnidentifiedImageError
 
 from pipelines.errors import CaptureError
 from pipelines.scene.panoramas import MODEL as PANORAMA
-from pipelines.tools.colmap import CameraGroup
 from pipelines.tools.colmap_results import SparseModel
+from pipelines.tools.colmap_settings import CameraGroup
 from pipelines.workspace import Workspace
 
 _LENS_KEYS = ("make", "model", "lens", "focal_mm", "focal_35mm")

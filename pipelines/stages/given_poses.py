@@ -29,7 +29,8 @@ from pipelines.sfm.given_refinement import Refined
 from pipelines.sfm.given_report import given_report, given_warnings
 from pipelines.sfm.tracks import Floats, apart_deg
 from pipelines.stage import REPORT, StageContext
-from pipelines.tools.colmap import FeatureSettings, Reconstructor, extraction_threads
+from pipelines.tools.colmap import Reconstructor
+from pipelines.tools.colmap_settings import FeatureSettings, extraction_threads
 from pipelines.workspace import SPARSE_POINTS
 
 MIN_TRACK = 3

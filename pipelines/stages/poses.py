@@ -23,7 +23,8 @@ from pipelines.exports.formats.ply import write_points
 from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.orientation import Normalisation, normalise, opengl_from_opencv
-from pipelines.sfm.attempts import Checkpoint, Ladder, num_processors
+from pipelines.sfm.attempts import Ladder, num_processors
+from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.clips import clip_warnings, clips_of
 from pipelines.sfm.found_images import FoundImages, found_images
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled

@@ -23,7 +23,6 @@ import tempfile
 import uuid
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +47,14 @@ from pipelines.tools.colmap_results import (
     read_statistics,
     sparse_model,
 )
+from pipelines.tools.colmap_settings import (
+    CameraGroup,
+    FeatureSettings,
+    MapperSettings,
+    extraction_options,
+    mapping_options,
+    verification_options,
+)
 from pipelines.tools.colmap_tracks import StoredTracks
 
 Watch = Callable[[int], None]
@@ -59,84 +66,7 @@ _PAIR_TILE = 12
 """Pairs are taken in tiles of 12 x 12 images, whose features then stay in memory."""
 _PAIR_PORTION = 72
 """Pairs matched in one call, which nobody hears of before it ends: 2 seconds at `preview` sizes."""
-_SIFT_BYTES_PER_PX = 85
-"""Measured: 75 to 87 per pixel, at 960 to 1,920 px, doubled or not, with one and two threads."""
-_QUICK_GROWTH = 1.4
-"""The model is adjusted as a whole each time it has grown by this factor; COLMAP's default 1.1
-costs twice the time and ends at the same errors, since the last adjustment is of all."""
-_QUICK_TRIALS = 1000
-"""Random samples of matches at most. COLMAP's 10,000 go to pairs that then fail all the same."""
 PER_IMAGE, SINGLE = pycolmap.CameraMode.PER_IMAGE, pycolmap.CameraMode.SINGLE
-
-
-@dataclass(frozen=True)
-class CameraGroup:
-    """Images, by index, that share one lens.
-
-    lens: COLMAP's camera model. focal_px: known beforehand, or None; COLMAP then starts from it,
-    and verifies pairs of images by a calibrated geometry.
-    """
-
-    indices: tuple[int, ...]
-    lens: str
-    focal_px: float | None = None
-
-
-@dataclass(frozen=True)
-class FeatureSettings:
-    """Which SIFT features are found.
-
-    max_image_px: long side at which they are found; positions are of the full image. num_features:
-    most per image, the coarsest first. upsample: double the image before, which finds two to four
-    times as many and places them a little better, for three times the work. num_threads: images
-    worked on at a time, -1 for one per processor (see `extraction_threads`).
-    """
-
-    max_image_px: int
-    num_features: int
-    upsample: bool = True
-    num_threads: int = -1
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """What incremental mapping demands before it believes; the defaults are COLMAP's.
-
-    min_num_matches: verified matches for a pair to count. init_*: of the pair that a model starts
-    from. pose_*: of the points by which an image is placed.
-    """
-
-    min_num_matches: int = 15
-    init_min_angle_deg: float = 16.0
-    init_min_num_inliers: int = 100
-    pose_min_num_inliers: int = 30
-    pose_min_inlier_ratio: float = 0.25
-
-
-@dataclass(frozen=True)
-class MapperSettings:
-    """How incremental mapping goes about it.
-
-    thorough: bundle adjustment as often as COLMAP does by default, instead of after each growth by
-    40 %. thresholds: lower ones are for captures that COLMAP's fail on.
-    """
-
-    refine_focal: bool = True
-    refine_principal_point: bool = False
-    thorough: bool = False
-    thresholds: Thresholds = field(default_factory=Thresholds)
-
-
-def extraction_threads(settings: FeatureSettings, memory_mb: int, num_processors: int) -> int:
-    """How many images SIFT may work on at a time within `memory_mb` (10^6 bytes), at least one.
-
-    A thread holds the finest octave of the scale space, its differences and gradients:
-    _SIFT_BYTES_PER_PX for each pixel of the image that it starts from, taken as 4:3.
-    """
-    wanted = num_processors if settings.num_threads < 0 else max(settings.num_threads, 1)
-    side = settings.max_image_px * (2 if settings.upsample else 1)
-    each = _SIFT_BYTES_PER_PX * side * side * 3 // 4
-    return max(1, min(wanted, memory_mb * 1_000_000 // each))
 
 
 class Reconstructor:
@@ -187,7 +117,7 @@ class Reconstructor:
         probe = self.scratch / "probe.db"
         probe.unlink(missing_ok=True)
         names = [self.names[index] for index in indices]
-        reader, options = pycolmap.ImageReaderOptions(), _extraction_options(settings)
+        reader, options = pycolmap.ImageReaderOptions(), extraction_options(settings)
         self.on(probe)._extract_portion(names, reader, options, PER_IMAGE, lambda _done: None, 0)
         counts = read_statistics(probe, len(self.names)).num_features
         return [int(counts[index]) for index in indices]
@@ -196,7 +126,7 @@ class Reconstructor:
         self, groups: Sequence[CameraGroup], settings: FeatureSettings, watch: Watch
     ) -> None:
         """Find SIFT features in every image; images of a group share one camera."""
-        options = _extraction_options(settings)
+        options = extraction_options(settings)
         step = max(_IMAGE_PORTION, 4 * settings.num_threads)
         done = 0
         for group in groups:
@@ -252,7 +182,7 @@ class Reconstructor:
         thorough: as many random trials as COLMAP's default, for pairs with few true matches.
         watch: receives the number of these pairs that are done.
         """
-        verification = _verification_options(self.seed, thorough=thorough)
+        verification = verification_options(self.seed, thorough=thorough)
         ordered = sorted(
             pairs, key=lambda pair: (pair[0] // _PAIR_TILE, pair[1] // _PAIR_TILE, pair)
         )
@@ -292,7 +222,7 @@ class Reconstructor:
         named.
         """
         output = Path(tempfile.mkdtemp(prefix="models-", dir=self.scratch))
-        options = self._mapping_options(settings)
+        options = mapping_options(settings, self.num_threads, self.seed)
         options.image_names = [self.names[index] for index in only]
         placed = [0]
 
@@ -331,7 +261,7 @@ class Reconstructor:
         found = place_others(
             self.database,
             model.stored,
-            self._mapping_options(settings),
+            mapping_options(settings, self.num_threads, self.seed),
             links=self.links,
             placed=watch,
             tidied=tidied,
@@ -419,26 +349,6 @@ class Reconstructor:
         """Descriptors of every image, [at most per_image, 128]. Not while another call runs."""
         return read_features(self.database, len(self.names), per_image)
 
-    def _mapping_options(self, settings: MapperSettings) -> Any:
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = self.num_threads
-        options.random_seed = self.seed
-        options.min_model_size = 3
-        options.max_num_models = 10
-        options.ba_refine_focal_length = settings.refine_focal
-        options.ba_refine_principal_point = settings.refine_principal_point
-        if not settings.thorough:
-            options.ba_global_frames_ratio = options.ba_global_points_ratio = _QUICK_GROWTH
-            options.ba_global_max_refinements = 2
-            options.ba_local_max_refinements = 1
-        wanted = settings.thresholds
-        options.min_num_matches = wanted.min_num_matches
-        options.mapper.init_min_tri_angle = wanted.init_min_angle_deg
-        options.mapper.init_min_num_inliers = wanted.init_min_num_inliers
-        options.mapper.abs_pose_min_num_inliers = wanted.pose_min_num_inliers
-        options.mapper.abs_pose_min_inlier_ratio = wanted.pose_min_inlier_ratio
-        return options
-
     def _prior_params(self, group: CameraGroup) -> str:
         """Parameters of the group's camera where its focal length is known, as COLMAP reads them.
 
@@ -490,22 +400,3 @@ def _name_again(path: Path, link: Path) -> None:
         os.link(path, link)
     except OSError:
         link.symlink_to(path)
-
-
-def _extraction_options(settings: FeatureSettings) -> Any:
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = settings.max_image_px
-    options.num_threads = settings.num_threads
-    options.sift.max_num_features = settings.num_features
-    options.sift.first_octave = -1 if settings.upsample else 0
-    return options
-
-
-def _verification_options(seed: int, *, thorough: bool) -> Any:
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
-    if not thorough:
-        options.ransac.min_num_trials = 30
-        options.ransac.max_num_trials = _QUICK_TRIALS
-        options.ransac.dyn_num_trials_multiplier = 1.0
-    return options

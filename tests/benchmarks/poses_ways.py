@@ -24,7 +24,8 @@ import pycolmap
 
 from pipelines.options import PosesOptions, resolve_options
 from pipelines.scene.orientation import opengl_from_opencv
-from pipelines.sfm.attempts import Checkpoint, Ladder, num_processors
+from pipelines.sfm.attempts import Ladder, num_processors
+from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.intrinsics import settle_lenses
 from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source, read_source

@@ -14,7 +14,8 @@ from PIL import Image
 
 from pipelines.options import PosesOptions
 from pipelines.scene.orientation import opengl_from_opencv
-from pipelines.sfm.attempts import KEY_FRAMES, Checkpoint, Ladder
+from pipelines.sfm.attempts import KEY_FRAMES, Ladder
+from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.key_frames import (
     LONG_FILM,
     NUM_KEYS,
@@ -30,8 +31,9 @@ from pipelines.sfm.report import Outcome
 from pipelines.sfm.rungs import RUNGS, Matches, Rung, Standing, always, not_yet_enough
 from pipelines.sfm.source import read_source
 from pipelines.stage import StageContext
-from pipelines.tools.colmap import MapperSettings, Reconstructor
+from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import PairStatistics
+from pipelines.tools.colmap_settings import MapperSettings
 from pipelines.workspace import Workspace
 from tests.benchmarks.pose_accuracy import compare
 from tests.unit.pipelines.sfm.synthetic_room import arc_poses, render, save_video_frames

@@ -8,11 +8,13 @@ import pytest
 from PIL import Image
 
 from pipelines.options import PosesOptions
-from pipelines.sfm.attempts import Checkpoint, Ladder
+from pipelines.sfm.attempts import Ladder
+from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.rungs import RUNGS, Matches, Rung, Standing, always, too_few_registered
 from pipelines.sfm.source import read_source
 from pipelines.stage import StageContext
-from pipelines.tools.colmap import MapperSettings, Reconstructor, Thresholds
+from pipelines.tools.colmap import Reconstructor
+from pipelines.tools.colmap_settings import MapperSettings, Thresholds
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.sfm.synthetic_room import arc_poses, render, save_video_frames
 

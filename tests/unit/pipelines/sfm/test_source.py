@@ -17,7 +17,8 @@ from pipelines.errors import CaptureError
 from pipelines.options import IngestOptions
 from pipelines.sfm.source import Source, camera_groups, prior_focal_px, read_source
 from pipelines.stages import ingest
-from pipelines.tools.colmap import FeatureSettings, Reconstructor
+from pipelines.tools.colmap import Reconstructor
+from pipelines.tools.colmap_settings import FeatureSettings
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.captures.archives import context, phone_exif, picture, write_zip
 

@@ -11,7 +11,8 @@ import pytest
 
 from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import Intrinsics
-from pipelines.sfm.attempts import Checkpoint, Ladder
+from pipelines.sfm.attempts import Ladder
+from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.report import Outcome, build_report, path_warnings
 from pipelines.sfm.rungs import RUNGS, Rung, Standing, too_few_registered
 from pipelines.sfm.source import Source, read_source

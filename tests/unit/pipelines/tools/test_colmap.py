@@ -10,13 +10,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from pipelines.tools.colmap import (
-    CameraGroup,
-    FeatureSettings,
-    Reconstructor,
-    extraction_threads,
-)
+from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_results import read_statistics
+from pipelines.tools.colmap_settings import CameraGroup, FeatureSettings, extraction_threads
 from tests.unit.pipelines.sfm.synthetic_room import arc_poses, render
 
 COARSE = FeatureSettings(400, 1500, upsample=False, num_threads=1)

@@ -1,4 +1,4 @@
-"""Progress of an attempt at a reconstruction."""
+"""Progress of the poses."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.sfm import attempts
-from pipelines.sfm.attempts import ProgressScale
+from pipelines.sfm import progress as progress_module
+from pipelines.sfm.progress import ProgressScale
 from pipelines.stage import StageContext
 from pipelines.workspace import Workspace
 
@@ -26,7 +26,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(attempts, "time", clock)
+    monkeypatch.setattr(progress_module, "time", clock)
     return clock
 
 
