@@ -66,7 +66,20 @@ class IngestOptions(StageOptions):
 class FramesOptions(StageOptions):
     """Which frames of a video are used."""
 
-    num_frames: int = Field(300, ge=8, le=5000, description="Frames wanted, at even times.")
+    num_frames: int = Field(
+        300,
+        ge=8,
+        le=5000,
+        description="Frames wanted, at even times; up to twice as many where `max_step` asks for "
+        "it.",
+    )
+    max_step: float = Field(
+        0.1,
+        ge=0.0,
+        le=1.0,
+        description="Where the picture moves further than this share of its long side from one "
+        "frame to the next, frames are taken at shorter times. 0 for even times.",
+    )
     long_side_px: int = Field(
         1920, ge=64, le=8192, description="Frames are reduced to this long side, in pixels."
     )

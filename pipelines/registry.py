@@ -55,7 +55,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="frames",
-        version=3,
+        version=4,
         after=("ingest",),
         reads=("ingest",),
         run="pipelines.stages.frames:run",

@@ -1,4 +1,5 @@
-"""Stage `frames`: the sharpest frame of each even time window of a film.
+"""Stage `frames`: the sharpest frame of each even time window of a film, of halves or thirds of it
+where the picture moves far meanwhile.
 
 Writes `images/frame_00001.jpg`, ... (upright, SDR, reduced) and `frames.json`: `{width, height,
 num_source_frames, warnings, clips: [{name, offset_s, duration_s, width, height, num_frames,
@@ -8,7 +9,7 @@ gain_ev}]}`. Frames of a 360-degree clip lie in `panoramas/`, and the views cut 
 `offset_s` is where a clip's own begin. speed: how fast the picture moved in the frame's window, the
 median, long sides per second, or null. gain_ev: stops by which exposure changed since the clip's
 first frame, as far as that was seen. Each clip is decoded once; of each window only the best frame
-so far is held.
+so far of each of its SLOTS is held.
 """
 
 from __future__ import annotations
@@ -47,15 +48,25 @@ PANORAMA_SHARE = 2
 """For so many frames that other films would give there is one panorama: it shows four views."""
 MIN_PER_CLIP = 8
 """Frames that a short clip gets beside long ones, as far as it has so many."""
+MAX_PARTS = 3
+"""Most frames of a window: films move unevenly, and frames that share nothing have no poses."""
+SLOTS = 6
+"""Of a window: halves and thirds are made of whole ones."""
+MIN_SHARPNESS = 0.3
+"""Of the window's sharpest frame, for another of it to be of use."""
+MAX_GROWTH = 2
+"""So many frames for each window that has passed are there at most."""
 
 
 @dataclass
 class _Windows:
-    """Keeps the sharpest frame of each window of a clip and writes it once the window has passed.
+    """Keeps the sharpest frames of each window of a clip and writes them once it has passed.
 
     rows: of all clips so far, to which the clip's are added. clip: its number. offset_s: what its
     times are counted from. num_windows: 0 to keep every frame. start_s, length_s: of a window's
-    grid, by the clip's own times. num_views: cut from each frame, which is a panorama then.
+    grid, by the clip's own times. max_step: long sides by which the picture may move from one
+    frame to the next, as far as MAX_PARTS and MAX_GROWTH allow; 0 for one frame a window.
+    num_views: cut from each frame, which is a panorama then.
     """
 
     out: Path
@@ -66,10 +77,12 @@ class _Windows:
     num_windows: int
     start_s: float
     length_s: float
+    max_step: float = 0.0
     num_views: int = 0
     num_seen: int = 0
-    _best: Frame | None = None
-    _best_sharpness: float = -1.0
+    num_kept: int = 0
+    _best: dict[int, tuple[float, Frame]] = field(default_factory=dict)
+    """Of each slot of the window: sharpness and frame."""
     _window: int = -1
     _meter: MotionMeter = field(default_factory=MotionMeter)
     _speeds: list[float] = field(default_factory=list)
@@ -78,7 +91,7 @@ class _Windows:
     def take(self, frame: Frame) -> None:
         """Look at the next frame, in order of time."""
         self.num_seen += 1
-        window = self._window_of(frame)
+        window, slot = divmod(self._slot_of(frame), SLOTS)
         sharpness = frame.sharpness()
         if window != self._window:
             self.flush()
@@ -88,14 +101,32 @@ class _Windows:
             self._speeds.append(step.speed)
         if step is not None and step.gain_ev is not None:
             self._gain_ev += step.gain_ev
-        if self._best is None or sharpness > self._best_sharpness:
-            self._best, self._best_sharpness = frame, sharpness
+        if slot not in self._best or sharpness > self._best[slot][0]:
+            self._best[slot] = sharpness, frame
 
     def flush(self) -> None:
-        """Write the best frame of the window that ends."""
-        frame = self._best
-        if frame is None:
-            return
+        """Write the best frames of the window that ends."""
+        num_parts = self._num_parts()
+        sharp_enough = MIN_SHARPNESS * max((each for each, _ in self._best.values()), default=0.0)
+        for part in range(num_parts):
+            slots = range(part * SLOTS // num_parts, (part + 1) * SLOTS // num_parts)
+            found = [self._best[slot] for slot in slots if slot in self._best]
+            sharpness, frame = max(found, key=lambda each: each[0], default=(0.0, None))
+            if frame is not None and sharpness >= sharp_enough:
+                self._write(sharpness, frame)
+        self._best.clear()
+        self._speeds.clear()
+
+    def _num_parts(self) -> int:
+        """How many frames the window gives: by how far the picture moved in it."""
+        if not self._speeds or self.max_step == 0 or self.num_windows == 0:
+            return 1
+        travel = statistics.fmean(self._speeds) * self.length_s
+        allowed = MAX_GROWTH * (self._window + 1) - self.num_kept
+        return max(1, min(math.ceil(travel / self.max_step), MAX_PARTS, allowed))
+
+    def _write(self, sharpness: float, frame: Frame) -> None:
+        self.num_kept += 1
         stem = f"frame_{len(self.rows) + 1:05d}"
         file = f"{PANORAMAS if self.num_views else 'images'}/{stem}.jpg"
         frame.save(self.out / file, self.jpeg_quality)
@@ -107,7 +138,7 @@ class _Windows:
                 if math.isfinite(frame.time_s)
                 else None,
                 "source_frame_index": frame.index,
-                "sharpness": round(self._best_sharpness, 3),
+                "sharpness": round(sharpness, 3),
                 "speed": round(statistics.median(self._speeds), 4) if self._speeds else None,
                 "gain_ev": round(self._gain_ev, 3),
             }
@@ -115,14 +146,13 @@ class _Windows:
         if self.num_views:
             views = write_views(self.out / file, self.out, stem, self.num_views)
             self.rows[-1]["views"] = views
-        self._best, self._best_sharpness = None, -1.0
-        self._speeds.clear()
 
-    def _window_of(self, frame: Frame) -> int:
+    def _slot_of(self, frame: Frame) -> int:
+        """Its number, counted over all windows."""
         if self.num_windows == 0 or not math.isfinite(frame.time_s):
-            return frame.index
-        cell = int((frame.time_s - self.start_s) / self.length_s)
-        return min(max(cell, 0), self.num_windows - 1)
+            return frame.index * SLOTS
+        cell = int((frame.time_s - self.start_s) / self.length_s * SLOTS)
+        return min(max(cell, 0), self.num_windows * SLOTS - 1)
 
 
 def run(options: FramesOptions, ctx: StageContext) -> dict[str, Any]:
@@ -249,6 +279,7 @@ def _read_clip(
         num_windows=0 if clip.num_frames <= share else share,
         start_s=clip.start_s,
         length_s=clip.length_s / share,
+        max_step=0.0 if clip.num_views else options.max_step,
         num_views=clip.num_views,
     )
     plan = DecodePlan(
@@ -259,7 +290,6 @@ def _read_clip(
         start_s=clip.start_s,
         step_s=_step(clip, share * options.candidates_per_frame),
     )
-    before = len(rows)
 
     def on_frame(frame: Frame) -> None:
         windows.take(frame)
@@ -268,7 +298,7 @@ def _read_clip(
     with clip_file(ctx.workspace.capture_file, clip, ctx.out) as file:
         num_decoded = decode(file, plan, ctx, on_frame)
     windows.flush()
-    return _Read(plan, scale.offset_s, num_decoded, windows.num_seen, len(rows) - before)
+    return _Read(plan, scale.offset_s, num_decoded, windows.num_seen, windows.num_kept)
 
 
 def _step(clip: Clip, wanted: int) -> float:

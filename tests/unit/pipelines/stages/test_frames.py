@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def test_sharp_frames_win_and_are_the_ones_they_are_said_to_be(
 
 def test_candidates_are_limited_and_even(tmp_path: Path) -> None:
     ingested(tmp_path, make_clip(tmp_path / "a.mp4", "testsrc2=s=320x180:r=60:d=4"))
-    summary, rows, _ = chosen(tmp_path, num_frames=10, candidates_per_frame=3)
+    summary, rows, _ = chosen(tmp_path, num_frames=10, candidates_per_frame=3, max_step=0)
     assert (summary["num_candidates"], summary["num_source_frames"]) == (30, 240)
     windows = [int(row["timestamp_s"] / 0.4) for row in rows]
     assert windows == list(range(10))
@@ -325,3 +326,54 @@ def test_video_of_two_frames_is_too_short(tmp_path: Path) -> None:
     with pytest.raises(CaptureError) as caught:
         ingested(tmp_path, clip)
     assert caught.value.code == "too_few_images"
+
+
+def panned(tmp_path: Path, speeds: Sequence[float]) -> Path:
+    """A clip of 30 frames a second that pans over a wall at each second's speed, in long sides."""
+    wall = np.random.default_rng(1).integers(40, 220, (45, 1200), np.uint8)
+    wide = np.asarray(PIL.Image.fromarray(wall).resize((4800, 180), PIL.Image.Resampling.BICUBIC))
+    (tmp_path / "wall").mkdir()
+    at = 0.0
+    for n in range(30 * len(speeds)):
+        PIL.Image.fromarray(wide[:, round(at) :][:, :320]).save(tmp_path / f"wall/{n:04d}.png")
+        at += speeds[n // 30] * 320 / 30
+    clip = tmp_path / "a.mp4"
+    ffmpeg("-framerate", "30", "-i", tmp_path / "wall/%04d.png", "-pix_fmt", "yuv420p", clip)
+    return clip
+
+
+def per_second(rows: list[dict[str, Any]]) -> list[int]:
+    return np.bincount([int(row["timestamp_s"]) for row in rows]).tolist()
+
+
+def test_more_frames_are_taken_where_the_picture_moves_far(tmp_path: Path) -> None:
+    """Eight frames a second; at a speed of 1.5 the picture moves by 0.19 from one to the next."""
+    ingested(tmp_path, panned(tmp_path, (0.2, 0.2, 1.5, 0.2)))
+    _, rows, _ = chosen(tmp_path, num_frames=32)
+    assert per_second(rows) == [8, 8, 16, 8]
+    times = np.array([row["timestamp_s"] for row in rows])
+    assert (np.diff(times) > 0).all()
+    fast = times[(times >= 2) & (times < 3)]
+    assert np.diff(fast).max() < 0.14, "each half of a window gives one"
+
+
+def test_twice_as_many_frames_are_taken_at_most(tmp_path: Path) -> None:
+    """Slow windows leave something for quick ones, of which each gives three at most."""
+    ingested(tmp_path, panned(tmp_path, (3.0, 3.0, 0.2, 3.0)))
+    summary, rows, _ = chosen(tmp_path, num_frames=32)
+    assert per_second(rows) == pytest.approx([16, 16, 8, 24], abs=1)
+    assert summary["num_frames"] == 64
+
+
+def test_even_times_can_be_had(tmp_path: Path) -> None:
+    ingested(tmp_path, panned(tmp_path, (0.2, 3.0)))
+    _, rows, _ = chosen(tmp_path, num_frames=16, max_step=0)
+    assert per_second(rows) == [8, 8]
+
+
+def test_a_quick_clip_gives_all_it_has_and_none_twice(tmp_path: Path) -> None:
+    ingested(tmp_path, panned(tmp_path, (4.0, 4.0)))
+    _, rows, _ = chosen(tmp_path, num_frames=48)
+    indices = [row["source_frame_index"] for row in rows]
+    assert indices == sorted(set(indices))
+    assert len(rows) == 60
