@@ -273,8 +273,16 @@ class AssessOptions(StageOptions):
         description="Above this share of surface points that other views see through, it does, "
         "too.",
     )
+    min_psnr: float = Field(
+        18.0,
+        ge=0,
+        le=100,
+        description="Below this PSNR of the model against held-out photos, the report warns of a "
+        "poor model. Unit: dB.",
+    )
     require_geometry: bool = Field(
-        False, description="Fail the job with geometry_poor in place of that warning."
+        False,
+        description="Fail the job with geometry_poor in place of its warning.",
     )
 
 

@@ -144,7 +144,7 @@ STAGES: tuple[Stage, ...] = (
     *(_export_stage(export) for export in EXPORTS),
     Stage(
         name="assess",
-        version=8,
+        version=9,
         after=("evaluate", "pointcloud", "mesh"),
         reads=("ingest", "frames", "poses", "depth", "train", "evaluate", "pointcloud", "mesh"),
         run="pipelines.stages.assess:run",

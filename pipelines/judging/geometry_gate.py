@@ -1,8 +1,10 @@
-"""Whether a job's surfaces hold together: a verdict from what was measured, with advice.
+"""Whether a job came out: verdicts from what was measured, with advice.
 
-Two things tell, and neither alone: how much of held-out views the mesh covers, and how much of what
-one view shows another sees through (`pipelines.nerf.judging.floaters`). docs/evaluation.md has the
-jobs that the limits were chosen on.
+Of its surfaces two things tell, and neither alone: how much of held-out views the mesh covers, and
+how much of what one view shows another sees through (`pipelines.nerf.judging.floaters`). Of the
+model its pictures tell: where they are far from held-out photos, mostly cameras were placed
+wrongly, and surfaces can hold together all the same. docs/evaluation.md has the jobs that the
+limits were chosen on.
 """
 
 from __future__ import annotations
@@ -14,6 +16,13 @@ CODE = "geometry_poor"
 HINT = (
     "Walk around the subject with more overlap, film plain surfaces with something textured in "
     "view, and give more light; a longer training (preset standard, on a GPU) helps, too."
+)
+
+MODEL_CODE = "model_poor"
+MODEL_HINT = (
+    "Mostly cameras were placed wrongly: look at the mesh. While you film, nothing may move or "
+    "change its light; what looks the same from several sides needs something beside it that tells "
+    "them apart, and is better filmed than photographed."
 )
 
 
@@ -46,4 +55,20 @@ def geometry_warning(
         "message": f"The surfaces do not hold together: {' and '.join(problems)}.",
         "hint": HINT,
         "details": {"coverage": coverage, "depth_inconsistency": depth_inconsistency},
+    }
+
+
+def model_warning(psnr: float | None, least: float) -> dict[str, Any] | None:
+    """A warning where pictures of the model are not at all like held-out photos.
+
+    psnr, least: dB; None where nothing was measured.
+    """
+    if psnr is None or psnr >= least:
+        return None
+    return {
+        "code": MODEL_CODE,
+        "message": f"Pictures of the model are unlike held-out photos: {psnr:.1f} dB "
+        f"(least: {least:.1f}).",
+        "hint": MODEL_HINT,
+        "details": {"psnr": psnr},
     }

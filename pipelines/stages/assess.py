@@ -38,7 +38,7 @@ from pipelines.judging.depth_scores import (
     fitted_scale,
     nearest,
 )
-from pipelines.judging.geometry_gate import Limits, geometry_warning
+from pipelines.judging.geometry_gate import Limits, geometry_warning, model_warning
 from pipelines.nerf.data.images import ImageData, load_images
 from pipelines.nerf.data.light import in_the_light_of
 from pipelines.nerf.judging.off_path import evenly
@@ -118,12 +118,18 @@ def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
     agreement, no_agreement = _against_agreed_depth(caster, views.frame, ctx.workspace)
     cloud = read_ply(cloud_of(ctx.workspace.stage("pointcloud")))
     cloud_rows, spacing = _look_at_cloud(cloud, views, ctx)
-    mesh_means, floaters = mean_scores(seen.rows), _floaters(ctx.workspace)
-    warning = geometry_warning(
+    metrics = json.loads((ctx.workspace.stage("evaluate") / "metrics.json").read_text("utf-8"))
+    mesh_means, floaters = mean_scores(seen.rows), _floaters(metrics)
+    poor = geometry_warning(
         mesh_means["coverage"],
         floaters,
         Limits(options.min_coverage, options.max_depth_inconsistency),
     )
+    warnings = [
+        warning
+        for warning in (poor, model_warning(metrics.get("psnr"), options.min_psnr))
+        if warning is not None
+    ]
     depth, no_depth = _against_sensor(seen.views, views, ctx.workspace)
     assets = {
         "views": describe(views),
@@ -135,7 +141,7 @@ def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
         "depth_reason": no_depth,
         "depth_inconsistency": floaters,
         "void": _before_void(seen.views, views),
-        "warnings": [] if warning is None else [warning],
+        "warnings": warnings,
         "definitions": DEFINITIONS,
         "per_view": [
             {"file": image.file, "mesh": mesh_row, "cloud": cloud_row}
@@ -143,15 +149,12 @@ def run(options: AssessOptions, ctx: StageContext) -> dict[str, Any]:
         ],
     }
     (ctx.out / "assets.json").write_text(json.dumps(assets, indent=1), "utf-8")
-    if warning is not None:
+    for warning in warnings:
         ctx.logger.warning("%s %s", warning["message"], warning["hint"])
-        if options.require_geometry:
-            raise ExportError(
-                warning["message"],
-                code=warning["code"],
-                hint=warning["hint"],
-                details=warning["details"],
-            )
+    if poor is not None and options.require_geometry:
+        raise ExportError(
+            poor["message"], code=poor["code"], hint=poor["hint"], details=poor["details"]
+        )
     ctx.progress(1.0, "measured", 0.0)
     return assets
 
@@ -260,9 +263,8 @@ def _before_void(seen: list[AssetView], views: Views) -> dict[str, float] | None
     }
 
 
-def _floaters(workspace: Workspace) -> float | None:
+def _floaters(metrics: dict[str, Any]) -> float | None:
     """The depth inconsistency that `evaluate` measured, if it did."""
-    metrics = json.loads((workspace.stage("evaluate") / "metrics.json").read_text("utf-8"))
     found = (metrics.get("floaters") or {}).get("depth_inconsistency")
     return None if found is None else float(found)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.judging.geometry_gate import Limits, geometry_warning
+from pipelines.judging.geometry_gate import Limits, geometry_warning, model_warning
 from pipelines.options import AssessOptions
 
 DEFAULTS = AssessOptions()
@@ -37,3 +37,17 @@ def test_jobs_whose_surfaces_fell_apart_are_warned_of(
 
 def test_what_was_not_measured_is_no_reason_to_warn() -> None:
     assert geometry_warning(None, None, LIMITS) is None
+
+
+@pytest.mark.parametrize("psnr", [18.8, 20.3, 25.4, None])
+def test_models_that_came_out_pass(psnr: float | None) -> None:
+    assert model_warning(psnr, DEFAULTS.min_psnr) is None
+
+
+@pytest.mark.parametrize("psnr", [11.8, 12.6, 17.0])
+def test_models_that_did_not_come_out_are_warned_of(psnr: float) -> None:
+    """Two that were folded, and one of white in front of every camera: surfaces held together."""
+    warning = model_warning(psnr, DEFAULTS.min_psnr)
+    assert warning is not None
+    assert warning["code"] == "model_poor"
+    assert f"{psnr:.1f} dB" in warning["message"]

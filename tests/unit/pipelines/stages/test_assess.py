@@ -224,6 +224,20 @@ def test_floaters_that_were_not_measured_leave_coverage_to_judge(job: Workspace)
     assert assets["warnings"] == []
 
 
+def test_a_model_unlike_the_photos_is_warned_of_beside_its_surfaces(job: Workspace) -> None:
+    _exact_assets(job, keep=0.08)
+    path = job.stage("evaluate") / "metrics.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "psnr": 12.6}))
+    assets = tiny_job.run(job, "assess", long_side_px=64)["summary"]
+    assert [warning["code"] for warning in assets["warnings"]] == ["geometry_poor", "model_poor"]
+    assert (
+        json.loads((job.stage("assess") / "assets.json").read_text())["warnings"]
+        == assets["warnings"]
+    )
+    kind = {"min_psnr": 12.0, "min_coverage": 0.0, "require_geometry": True}
+    assert tiny_job.run(job, "assess", long_side_px=64, **kind)["summary"]["warnings"] == []
+
+
 def _with_depth(job: Workspace, zoom: float = 1.0) -> None:
     """Give every image exact depth. zoom: of the lens by which it was written."""
     path = job.stage("train") / "cameras.json"
