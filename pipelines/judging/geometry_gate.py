@@ -2,8 +2,8 @@
 
 Of its surfaces two things tell, and neither alone: how much of held-out views the mesh covers, and
 how much of what one view shows another sees through (`pipelines.nerf.judging.floaters`). Of the
-model its pictures tell: where they are far from held-out photos, mostly cameras were placed
-wrongly, and surfaces can hold together all the same. docs/evaluation.md has the jobs that the
+model its pictures tell: where they are far from held-out photos, cameras may be placed wrongly,
+and surfaces can hold together all the same. docs/evaluation.md has the jobs that the
 limits were chosen on.
 """
 
@@ -20,9 +20,9 @@ HINT = (
 
 MODEL_CODE = "model_poor"
 MODEL_HINT = (
-    "Mostly cameras were placed wrongly: look at the mesh. While you film, nothing may move or "
-    "change its light; what looks the same from several sides needs something beside it that tells "
-    "them apart, and is better filmed than photographed."
+    "Look at the mesh. Where it is wrong, too, cameras were placed wrongly: nothing may move or "
+    "change its light while you film, and what looks the same from several sides needs something "
+    "beside it that tells them apart. Where it is right, pictures are too few or too far apart."
 )
 
 
