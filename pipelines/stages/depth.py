@@ -249,7 +249,11 @@ class _Search:
             known = up_and_points(self.ctx.workspace, self.capture)
             given = views, self.color_picture, maps.z, *known, sensed, self.patches
             sky = find_sky(*given, quarter(1, "looking for the sky"))
-            told["sky"] = {**_rounded(sky.share, sky.num_views), "far": round(sky.far, 3)}
+            told["sky"] = {
+                **_rounded(sky.share, sky.num_views),
+                "far": round(sky.far, 3),
+                "by_day": sky.by_day,
+            }
             masks = sky.masks
         # By day what is black is an unlit side of something.
         is_day = bool(told.get("sky", {}).get("share"))

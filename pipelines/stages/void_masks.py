@@ -97,9 +97,10 @@ def _looks(workspace: Workspace, capture: CamerasFile, told: dict[str, Any]) -> 
         looks.append(
             lambda view, picture: blank_of(view, like_blank(view, picture, color), on_thing)
         )
-    if told.get("sky", {}).get("share"):
-        known = up_and_points(workspace, capture)
-        looks.append(lambda view, picture: like_sky(view, picture, *known))
+    sky = told.get("sky", {})
+    if sky.get("share"):
+        known, by_day = up_and_points(workspace, capture), bool(sky.get("by_day"))
+        looks.append(lambda view, picture: like_sky(view, picture, *known, by_day=by_day))
     if told.get("dark", {}).get("share"):
         solid = _solid_points(workspace, capture)
         looks.append(lambda view, picture: like_dark(view, picture) & ~before_solid(view, solid))

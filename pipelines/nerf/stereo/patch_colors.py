@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from skimage.filters import gaussian
 from skimage.morphology import dilation, erosion
 from skimage.segmentation import expand_labels
 
@@ -70,17 +71,28 @@ class PatchColors:
         near: Bools = apart <= _ALIKE
         return near
 
-    def with_fringes(self, chosen: Bools) -> Bools:
+    def with_fringes(self, chosen: Bools, *, local: bool = False) -> Bools:
         """[H, W]: the patches chosen [N], and what has their colour beside them.
 
-        Patches end before the things that they surround do.
+        Patches end before the things that they surround do. local: the colour that they have
+        there, where one is not the same all over.
         """
         found: Bools = chosen[self.labels] & self.there
         expand: Any = expand_labels
         own = expand(np.where(found, self.labels + 1, 0), _FRINGE_PX)
-        off = np.abs(self.picture / 255.0 - self.mean[np.maximum(own - 1, 0)]).max(axis=-1)
+        color = self._near(found) if local else self.mean[np.maximum(own - 1, 0)]
+        off = np.abs(self.picture / 255.0 - color).max(axis=-1)
         fringed: Bools = found | (self.there & (own > 0) & (off <= _ALIKE))
         return fringed
+
+    def _near(self, found: Bools) -> Floats:
+        """[H, W, 3]: the mean colour of what is found near each pixel."""
+        smooth: Any = gaussian
+        weight = smooth(found.astype(np.float64), _FRINGE_PX)
+        channels = (self.picture / 255.0 * found[..., None]).transpose(2, 0, 1)
+        sums = np.stack([smooth(channel, _FRINGE_PX) for channel in channels], axis=-1)
+        near: Floats = sums / np.maximum(weight, 1e-6)[..., None]
+        return near
 
 
 def grown(mask: Bools, radius: int) -> Bools:

@@ -6,6 +6,10 @@ sky is told by what one picture shows and by what is far: a plain, bright and no
 picture's border, all of it above the horizon, without a point of structure from motion in it; and
 in the capture such patches border on what is far away, as walls and ceilings of rooms do not.
 
+By day that is not asked: a facade has nothing behind it. Where a tenth of all pictures is blue as
+air is, brighter or paler along a smooth slope, without a point, above the horizon and nowhere below
+it, this is sky, and so is what is white beside it or at the top of other pictures.
+
 Depth is along the camera's axis (z), 0 where unknown.
 """
 
@@ -13,9 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from skimage.measure import label
 
 from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.stereo.patch_colors import (
@@ -23,6 +29,7 @@ from pipelines.nerf.stereo.patch_colors import (
     Bytes,
     Floats,
     PatchColors,
+    at_border,
     grown,
 )
 from pipelines.nerf.stereo.patches import Labels, shelved_patches
@@ -46,19 +53,32 @@ as the median of all that they know. Not more of it: patches' own wrong depths l
 _LEAST_VIEWS, _LEAST_SHARE = 3, 0.01
 """So many views show it, and so much of all pictures is it."""
 
+_LEAST_BLUE, _LEAST_GREEN, _MOST_UNEVEN = 0.12, 0.33, 0.05
+"""Of a blue sky: by how much more blue than red it has; where its green lies between these two, 0
+to 1, screens and paints mostly being lower; and what the smoothest slope leaves of its colours'
+spread. Skies at hand have .13 to .37, .5 to .7 and .01 to .043."""
+_LEAST_DAY_SHARE, _MOST_BELOW = 0.1, 0.25
+"""So much of all pictures is blue sky by day; and for its area, so much alike reaches below the
+horizon: walls and cloths do."""
+_LEAST_OF_TOP = 0.3
+"""Of the picture's upper border, that a white sky takes by day."""
+_LEAST_CLOUD, _MOST_CLOUD = 0.5, 0.1
+"""Brightest channel of what the sky surrounds and is sky, and how much of the picture one takes."""
+
 
 @dataclass(frozen=True)
 class Sky:
     """masks: what of each view's picture is sky, [H, W]; none where the capture shows no sky.
 
     share: of all pictures. num_views: that show some, or may. far: in what share of these it
-    borders on what is far away.
+    borders on what is far away. by_day: whether it is known to be sky for being blue.
     """
 
     masks: list[Bools]
     share: float
     num_views: int
     far: float
+    by_day: bool = False
 
 
 def find_sky(
@@ -80,56 +100,176 @@ def find_sky(
     that is done; may raise.
     """
 
-    def look(index: int) -> tuple[Bools, bool | None]:
+    def look(index: int) -> tuple[Bools, bool | None, Bools, tuple[float, float]]:
         view, z = views[index], depths[index]
         parts = shelved_patches(view, index, patches)
-        mask = like_sky(view, picture_of(index), up, points, parts)
+        look = _Look.at(view, picture_of(index), up, points, parts)
+        mask, by_day, blue = look.sky(), look.sky_by_day(), look.blue()
         if not mask.any() or not (z > 0).any():
-            return mask, None
+            return mask, None, by_day, blue
         ring = grown(mask, _RING_TO_PX) & ~grown(mask, _RING_FROM_PX) & (z > 0)
         farthest = np.percentile(z[ring], _FAR_PERCENT) if ring.any() else 0.0
-        return mask, bool(farthest >= _FAR * np.median(z[z > 0]))
+        return mask, bool(farthest >= _FAR * np.median(z[z > 0])), by_day, blue
 
-    found, is_far = [], []
-    for index, (mask, far_behind) in enumerate(each_ahead(look, range(len(views)))):
+    found, is_far, found_by_day, blues = [], [], [], []
+    for index, (mask, far_behind, mask_by_day, blue) in enumerate(
+        each_ahead(look, range(len(views)))
+    ):
         found.append(mask)
+        found_by_day.append(mask_by_day)
+        blues.append(blue)
         is_far += [] if far_behind is None else [far_behind]
         on_share((index + 1) / len(views))
     far = float(np.mean(is_far)) if is_far else 0.0
+    above, below = np.mean(blues, axis=0)
+    by_day = above >= _LEAST_DAY_SHARE and below <= _MOST_BELOW * above
+    if by_day:
+        found = found_by_day
     num_views = sum(bool(mask.any()) for mask in found)
     share = float(np.mean([mask.mean() for mask in found]))
     too_little = num_views < _LEAST_VIEWS or share < _LEAST_SHARE
-    if too_little or far < _LEAST_FAR or is_measured(found, measured):
-        found, share = [np.zeros_like(mask) for mask in found], 0.0
-    return Sky(found, share, num_views, far)
+    if too_little or (far < _LEAST_FAR and not by_day) or is_measured(found, measured):
+        found, share, by_day = [np.zeros_like(mask) for mask in found], 0.0, False
+    return Sky(found, share, num_views, far, bool(by_day))
 
 
 def like_sky(
-    view: StereoView, picture: Bytes, up: Floats, points: Floats, patches: Labels | None = None
+    view: StereoView,
+    picture: Bytes,
+    up: Floats,
+    points: Floats,
+    patches: Labels | None = None,
+    *,
+    by_day: bool = False,
 ) -> Bools:
     """[H, W]: what of one picture may be sky, and is, where its capture shows any.
 
     As `find_sky`; patches: the picture's `patches_of`, where they are known. Small patches, and
     what the picture's border does not touch, are sky where they look like a patch of it that is
-    found, and are as high.
+    found, and are as high. by_day: as `Sky`.
     """
-    seen = PatchColors.of(view, picture, patches)
-    labels, mean = seen.labels, seen.mean
-    rows_columns = view.seen_at(points)[1:]
-    on_inside = labels[rows_columns][seen.inside[rows_columns]]
-    num_points = np.bincount(on_inside, minlength=len(mean))
-    looks = (seen.spread <= _MOST_SPREAD) & (mean.max(axis=-1) >= _LEAST_BRIGHT)
-    looks &= (mean.min(axis=-1) >= _LEAST_EACH) & (mean[:, 0] - mean[:, 2] <= _MOST_WARM)
-    looks &= (seen.area > 0) & (num_points <= _MOST_POINTS * seen.num_inside)
-    height = _elevation(view, up)
-    lowest = np.full(len(mean), -np.inf)
-    for patch in np.flatnonzero(looks):
-        lowest[patch] = np.percentile(height[seen.there & (labels == patch)], _LOW_PERCENT)
-    sure = looks & seen.is_large & (lowest > _HORIZON_DEG)
-    if not sure.any():
-        return np.zeros_like(seen.there)
-    also = looks & seen.alike(sure) & (lowest >= lowest[sure].min())
-    return seen.with_fringes(sure | also)
+    look = _Look.at(view, picture, up, points, patches)
+    return look.sky_by_day() if by_day else look.sky()
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A picture's patches, N of them.
+
+    height: [H, W], degrees above the horizon. is_bare: [N], with hardly a point of structure from
+    motion.
+    """
+
+    seen: PatchColors
+    height: Floats
+    is_bare: Bools
+
+    @classmethod
+    def at(
+        cls, view: StereoView, picture: Bytes, up: Floats, points: Floats, patches: Labels | None
+    ) -> _Look:
+        seen = PatchColors.of(view, picture, patches)
+        rows_columns = view.seen_at(points)[1:]
+        on_inside = seen.labels[rows_columns][seen.inside[rows_columns]]
+        num_points = np.bincount(on_inside, minlength=len(seen.mean))
+        bare = (seen.area > 0) & (num_points <= _MOST_POINTS * seen.num_inside)
+        return cls(seen, _elevation(view, up), bare)
+
+    def sky(self) -> Bools:
+        """[H, W]: plain, bright, not warm."""
+        seen = self.seen
+        looks = self.is_bare & (seen.spread <= _MOST_SPREAD) & self._is_pale()
+        lowest = self._lowest(looks)
+        sure = looks & seen.is_large & (lowest > _HORIZON_DEG)
+        if not sure.any():
+            return np.zeros_like(seen.there)
+        also = looks & seen.alike(sure) & (lowest >= lowest[sure].min())
+        return seen.with_fringes(sure | also)
+
+    def sky_by_day(self) -> Bools:
+        """[H, W]: blue or white along a slope, and the clouds in it."""
+        seen = self.seen
+        smooth = self._is_smooth(self.is_bare & (self._is_blue() | self._is_pale()))
+        lowest = self._lowest(smooth)
+        sure = smooth & (lowest > _HORIZON_DEG)
+        sure &= self._is_blue() | (self._of_top() >= _LEAST_OF_TOP)
+        if not sure.any():
+            return np.zeros_like(seen.there)
+        plain = self.is_bare & (seen.spread <= _MOST_SPREAD) & (self._is_blue() | self._is_pale())
+        also = plain & seen.alike(sure) & (self._lowest(plain) >= lowest[sure].min())
+        return self._with_clouds(seen.with_fringes(sure | also, local=True))
+
+    def blue(self) -> tuple[float, float]:
+        """What shares of the picture are a blue sky, and alike but reach below the horizon."""
+        smooth = self._is_smooth(self.is_bare & self._is_blue())
+        above = smooth & (self._lowest(smooth) > _HORIZON_DEG)
+        area = self.seen.area / self.seen.there.size
+        return float(area[above].sum()), float(area[smooth & ~above].sum())
+
+    def _is_pale(self) -> Bools:
+        mean = self.seen.mean
+        bright = (mean.max(axis=-1) >= _LEAST_BRIGHT) & (mean.min(axis=-1) >= _LEAST_EACH)
+        pale: Bools = bright & (mean[:, 0] - mean[:, 2] <= _MOST_WARM)
+        return pale
+
+    def _is_blue(self) -> Bools:
+        red, green, blue = self.seen.mean.T
+        more = blue - red
+        azure: Bools = (
+            (more >= _LEAST_BLUE) & (green <= blue) & (green - red >= _LEAST_GREEN * more)
+        )
+        return azure
+
+    def _is_smooth(self, of: Bools) -> Bools:
+        """[N]: the large ones among those that have little but one slope of colours, quadratic."""
+        seen = self.seen
+        height, width = seen.there.shape
+        smooth = np.zeros_like(of)
+        for patch in np.flatnonzero(of & seen.is_large):
+            own = seen.there & (seen.labels == patch)
+            inside = own & seen.inside
+            rows, columns = np.nonzero(inside if inside.any() else own)
+            y, x = rows / height - 0.5, columns / width - 0.5
+            terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+            colors = seen.picture[rows, columns] / 255.0
+            slope = np.linalg.lstsq(terms, colors, rcond=None)[0]
+            smooth[patch] = (colors - terms @ slope).std(axis=0).max() <= _MOST_UNEVEN
+        return smooth
+
+    def _lowest(self, of: Bools) -> Floats:
+        """[N]: above which nearly all of each of those is; of the others nothing."""
+        lowest = np.full(len(of), -np.inf)
+        for patch in np.flatnonzero(of):
+            pixels = self.seen.there & (self.seen.labels == patch)
+            lowest[patch] = np.percentile(self.height[pixels], _LOW_PERCENT)
+        return lowest
+
+    def _of_top(self) -> Floats:
+        """[N]: what share of the picture's upper border each takes."""
+        border = at_border(self.seen.there)
+        low, high = self.height[border].min(), self.height[border].max()
+        top = border & (self.height >= high - 0.25 * (high - low))
+        share: Floats = np.bincount(self.seen.labels[top], minlength=len(self.is_bare)) / top.sum()
+        return share
+
+    def _with_clouds(self, sky: Bools) -> Bools:
+        """[H, W]: with what is bright and bare and touches nothing but sky and the border."""
+        seen = self.seen
+        label_all: Any = label
+        parts = label_all(~sky & seen.there, connectivity=1)
+        num = int(parts.max()) + 1
+        lowest_sky = np.percentile(self.height[sky], _LOW_PERCENT)
+        bright = np.bincount(parts.ravel(), (seen.picture.max(axis=-1) / 255.0).ravel(), num)
+        area = np.maximum(np.bincount(parts.ravel(), minlength=num), 1)
+        low = np.full(num, np.inf)
+        np.minimum.at(low, parts.ravel(), self.height.ravel())
+        has_points = np.zeros(num, np.bool_)
+        has_points[np.unique(parts[~self.is_bare[seen.labels]])] = True
+        clouds = (bright / area >= _LEAST_CLOUD) & (low > lowest_sky) & ~has_points
+        clouds &= area <= _MOST_CLOUD * sky.size
+        clouds[0] = False
+        found: Bools = sky | clouds[parts]
+        return found
 
 
 def _elevation(view: StereoView, up: Floats) -> Floats:

@@ -10,6 +10,7 @@ import pytest
 from pipelines.nerf.stereo.sky import Sky, find_sky
 from tests.unit.pipelines.nerf.stereo.monument import (
     NUM_VIEWS,
+    ON_HOUSES,
     SKY_COLOR,
     UP,
     Seen,
@@ -103,3 +104,93 @@ def test_dark_twigs_at_its_border_make_it_no_less_sky() -> None:
     assert found.num_views == NUM_VIEWS
     for one, mask in zip(seen, found.masks, strict=True):
         assert mask[one.is_void].mean() > 0.95
+
+
+ZENITH, HORIZON = np.array([0.30, 0.52, 0.85]), np.array([0.70, 0.86, 1.00])
+
+
+def painted(one: Seen, where: np.ndarray, color: np.ndarray) -> Seen:
+    """The view with another colour there, [3] or [H, W, 3], sRGB in [0, 1]."""
+    picture = np.where(where[..., None], np.rint(255.0 * color), one.picture).astype(np.uint8)
+    grey = (picture.mean(axis=-1) / 255.0).astype(np.float32)
+    view = dataclasses.replace(one.view, picture=grey)
+    return dataclasses.replace(one, view=view, picture=picture)
+
+
+def by_day(above: np.ndarray = ZENITH, houses: float = 7.0) -> list[Seen]:
+    """Close houses, that is, nothing far behind anything, below a sky that pales downwards."""
+    seen = walk_round(houses=houses)
+    height = seen[0].picture.shape[0]
+    down = np.linspace(0.0, 2.0, height).clip(0.0, 1.0)[:, None, None]
+    slope = (1.0 - down) * above + down * HORIZON
+    return [painted(one, one.is_void, np.broadcast_to(slope, one.picture.shape)) for one in seen]
+
+
+def test_a_blue_sky_is_known_without_anything_far_behind() -> None:
+    seen = by_day()
+    assert np.std(seen[0].picture[seen[0].is_void] / 255.0, axis=0).max() > 0.06
+    found = sky_of(seen)
+    assert found.by_day
+    for one, mask in zip(seen, found.masks, strict=True):
+        assert mask[one.is_void].mean() > 0.97
+        assert mask[~one.is_void].mean() < 0.01
+
+
+def test_by_day_some_pictures_show_it_white() -> None:
+    """The camera looks towards the sun, or exposes for the shade."""
+    white = np.array([0.99, 1.0, 1.0])
+    seen = [painted(one, one.is_void, white) if i > 5 else one for i, one in enumerate(by_day())]
+    found = sky_of(seen)
+    assert found.by_day
+    for one, mask in zip(seen, found.masks, strict=True):
+        assert mask[one.is_void].mean() > 0.97
+        assert mask[~one.is_void].mean() < 0.01
+
+
+def test_clouds_are_sky_and_birds_and_lamps_are_not() -> None:
+    seen, clouds, lamps = [], [], []
+    rng = np.random.default_rng(0)
+    for one in by_day():
+        rows, columns = np.mgrid[: one.picture.shape[0], : one.picture.shape[1]]
+        cloud = (np.hypot(rows - 18, 0.5 * (columns - 95)) < 9) & one.is_void
+        lamp = (np.hypot(rows - 15, columns - 20) < 6) & one.is_void
+        billows = 0.75 + 0.2 * rng.random((*cloud.shape, 1)) * np.ones(3)
+        seen.append(painted(painted(one, cloud, billows), lamp, np.array([0.1, 0.1, 0.1])))
+        clouds.append(cloud)
+        lamps.append(lamp)
+    found = sky_of(seen)
+    assert found.by_day
+    for mask, cloud, lamp in zip(found.masks, clouds, lamps, strict=True):
+        assert mask[cloud].mean() > 0.97
+        assert mask[lamp].mean() < 0.2
+
+
+def test_a_blue_wall_that_reaches_below_the_horizon_is_no_sky() -> None:
+    """Houses painted like the sky: one blue wall from the ground up."""
+    seen = [painted(one, one.what == ON_HOUSES, HORIZON) for one in by_day(HORIZON)]
+    found = sky_of(seen)
+    assert not found.by_day
+    assert found.share == 0.0
+
+
+@pytest.mark.parametrize("color", [(0.27, 0.33, 0.57), (0.69, 0.71, 0.81), (0.55, 0.45, 0.75)])
+def test_screens_and_paints_are_no_sky(color: tuple[float, float, float]) -> None:
+    seen = [painted(one, one.is_void, np.array(color)) for one in by_day()]
+    assert sky_of(seen).share == 0.0
+
+
+def test_a_little_blue_is_no_sky() -> None:
+    wood = np.array([0.5, 0.35, 0.2])
+    seen = [painted(one, one.is_void, wood) if i > 2 else one for i, one in enumerate(by_day())]
+    found = sky_of(seen)
+    assert not found.by_day
+    assert found.share == 0.0
+
+
+def test_by_day_what_a_sensor_measures_is_no_sky() -> None:
+    seen = by_day()
+    hall = [np.where(one.is_void, np.float32(9.0), one.depth) for one in seen]
+    given = [one.view for one in seen], lambda index: seen[index].picture
+    depths = [one.known().z for one in seen]
+    assert find_sky(*given, depths, UP, NO_POINTS, hall).share == 0.0
+    assert find_sky(*given, depths, UP, NO_POINTS, [None] * len(seen)).by_day
