@@ -41,7 +41,7 @@ class MeshOptions(CropOptions, TextureOptions):
         description="How depth becomes a surface: tsdf fuses it in a field of voxels; poisson lays "
         "a smooth surface through the points that views agree on, closes small holes, and takes "
         "longer; where its solver fails, tsdf is what is done. auto is poisson where the cameras "
-        "stand around what they look at, and tsdf where they look about, as in a room. "
+        "look at one place, and tsdf where they look about, as in a room. "
         "marching_cubes takes the trained density itself at density_level, near what the views "
         "see.",
     )

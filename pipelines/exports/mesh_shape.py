@@ -26,7 +26,7 @@ from pipelines.exports.placement import Placement
 from pipelines.exports.reduction import reduced
 from pipelines.exports.subject import Decision, Thing
 from pipelines.exports.subject_files import as_dict
-from pipelines.exports.subject_search import SEARCH_SHARE, search_subject, stand_around
+from pipelines.exports.subject_search import SEARCH_SHARE, look_at_one_place, search_subject
 from pipelines.exports.surface.holes import close_holes, hole_limits
 from pipelines.exports.surface.outlines import outlined
 from pipelines.exports.surface.refinement import refined
@@ -127,7 +127,7 @@ def plan_of(scene: TrainedScene, options: MeshOptions, place: Placement, ctx: St
     decision = search() if crop is None and options.extent != "scene" else None
     method = options.method
     if method == "auto":
-        method = "poisson" if stand_around(scene) else "tsdf"
+        method = "poisson" if look_at_one_place(scene) else "tsdf"
     return Plan(images, lenses, shells, method, known, crop, told_crop, decision)
 
 

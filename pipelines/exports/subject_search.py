@@ -40,9 +40,9 @@ _MAX_FACES = 50_000
 _RENDERED = 0.8
 
 
-def stand_around(scene: TrainedScene) -> bool:
-    """Whether the cameras stand around what they look at, by the cameras alone."""
-    return told_by_cameras(_gaze(scene)).why is None
+def look_at_one_place(scene: TrainedScene) -> bool:
+    """Whether the cameras look at one place, from wherever, by the cameras alone."""
+    return told_by_cameras(_gaze(scene)).at_one_place
 
 
 def search_subject(

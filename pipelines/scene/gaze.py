@@ -57,6 +57,11 @@ class Told:
     measures: dict[str, Any] = field(default_factory=dict)
     where: tuple[Floats, float] | None = None
 
+    @property
+    def at_one_place(self) -> bool:
+        """Whether most look at one place, be it from one side only."""
+        return bool(self.measures.get("looking", 0.0) >= LEAST_LOOKING)
+
 
 def gaze_of(images: list[PosedImage], lenses: list[Intrinsics]) -> Gaze:
     """The cameras of a capture as the rule wants them."""

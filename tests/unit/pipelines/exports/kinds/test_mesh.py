@@ -88,15 +88,18 @@ def test_nothing_is_painted_where_no_file_carries_a_texture(job: Workspace) -> N
             assert isinstance(read_mesh(job.stage("mesh") / "subject.glb"), TexturedMesh)
 
 
-def test_the_method_is_that_of_how_the_cameras_stand(
+def test_the_method_is_that_of_where_the_cameras_look(
     job: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever is asked for of it: they stand around a bowl here."""
+    """Whatever is asked for of it: at a bowl here, and be it from one side."""
     plain = {"texture": "none", "refine": "none"}
     crop = {"shape": "sphere", "center": (0.0, 0.0, 0.0), "size": (4.0, 4.0, 4.0)}
     for asked in ({}, {"extent": "scene"}, {"crop": crop}):
         assert tiny_job.run(job, "mesh", **plain, **asked)["summary"]["method"] == "poisson", asked
     monkeypatch.setattr(gaze, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
+    made = tiny_job.run(job, "mesh", **plain)["summary"]
+    assert (made["method"], made["subject"]["kind"]) == ("poisson", "scene")
+    monkeypatch.setattr(gaze, "LEAST_LOOKING", 1.1)  # nor do so many look at one place
     assert tiny_job.run(job, "mesh", **plain)["summary"]["method"] == "tsdf"
     assert tiny_job.run(job, "mesh", method="poisson", **plain)["summary"]["method"] == "poisson"
 
