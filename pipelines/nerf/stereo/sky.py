@@ -15,6 +15,7 @@ Depth is along the camera's axis (z), 0 where unknown.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -156,12 +157,13 @@ def like_sky(
 class _Look:
     """A picture's patches, N of them.
 
-    height: [H, W], degrees above the horizon. is_bare: [N], with hardly a point of structure from
-    motion.
+    height: [H, W], degrees above the horizon. num_points: [H, W], of structure from motion.
+    is_bare: [N], with hardly any.
     """
 
     seen: PatchColors
     height: Floats
+    num_points: NDArray[np.int64]
     is_bare: Bools
 
     @classmethod
@@ -169,11 +171,13 @@ class _Look:
         cls, view: StereoView, picture: Bytes, up: Floats, points: Floats, patches: Labels | None
     ) -> _Look:
         seen = PatchColors.of(view, picture, patches)
-        rows_columns = view.seen_at(points)[1:]
-        on_inside = seen.labels[rows_columns][seen.inside[rows_columns]]
-        num_points = np.bincount(on_inside, minlength=len(seen.mean))
-        bare = (seen.area > 0) & (num_points <= _MOST_POINTS * seen.num_inside)
-        return cls(seen, _elevation(view, up), bare)
+        num_points = np.zeros(seen.there.shape, np.int64)
+        np.add.at(num_points, view.seen_at(points)[1:], 1)
+        inside = np.bincount(
+            seen.labels[seen.inside], num_points[seen.inside], minlength=len(seen.mean)
+        )
+        bare = (seen.area > 0) & (inside <= _MOST_POINTS * seen.num_inside)
+        return cls(seen, _elevation(view, up), num_points, bare)
 
     def sky(self) -> Bools:
         """[H, W]: plain, bright, not warm."""
@@ -189,9 +193,8 @@ class _Look:
     def sky_by_day(self) -> Bools:
         """[H, W]: blue or white along a slope, and the clouds in it."""
         seen = self.seen
-        smooth = self._is_smooth(self.is_bare & (self._is_blue() | self._is_pale()))
-        lowest = self._lowest(smooth)
-        sure = smooth & (lowest > _HORIZON_DEG)
+        lowest = self._lowest(self.is_smooth)
+        sure = self.is_smooth & (lowest > _HORIZON_DEG)
         sure &= self._is_blue() | (self._of_top() >= _LEAST_OF_TOP)
         if not sure.any():
             return np.zeros_like(seen.there)
@@ -201,7 +204,7 @@ class _Look:
 
     def blue(self) -> tuple[float, float]:
         """What shares of the picture are a blue sky, and alike but reach below the horizon."""
-        smooth = self._is_smooth(self.is_bare & self._is_blue())
+        smooth = self.is_smooth & self._is_blue()
         above = smooth & (self._lowest(smooth) > _HORIZON_DEG)
         area = self.seen.area / self.seen.there.size
         return float(area[above].sum()), float(area[smooth & ~above].sum())
@@ -220,12 +223,15 @@ class _Look:
         )
         return azure
 
-    def _is_smooth(self, of: Bools) -> Bools:
-        """[N]: the large ones among those that have little but one slope of colours, quadratic."""
+    @functools.cached_property
+    def is_smooth(self) -> Bools:
+        """[N]: large, bare, blue or pale, with little but one slope of colours, quadratic."""
         seen = self.seen
         height, width = seen.there.shape
-        smooth = np.zeros_like(of)
-        for patch in np.flatnonzero(of & seen.is_large):
+        smooth = np.zeros_like(self.is_bare)
+        for patch in np.flatnonzero(
+            seen.is_large & self.is_bare & (self._is_blue() | self._is_pale())
+        ):
             own = seen.there & (seen.labels == patch)
             inside = own & seen.inside
             rows, columns = np.nonzero(inside if inside.any() else own)
@@ -253,20 +259,21 @@ class _Look:
         return share
 
     def _with_clouds(self, sky: Bools) -> Bools:
-        """[H, W]: with what is bright and bare and touches nothing but sky and the border."""
-        seen = self.seen
+        """[H, W]: with what is bright, not warm, bare, and touches nothing but sky and border."""
         label_all: Any = label
-        parts = label_all(~sky & seen.there, connectivity=1)
-        num = int(parts.max()) + 1
-        lowest_sky = np.percentile(self.height[sky], _LOW_PERCENT)
-        bright = np.bincount(parts.ravel(), (seen.picture.max(axis=-1) / 255.0).ravel(), num)
-        area = np.maximum(np.bincount(parts.ravel(), minlength=num), 1)
+        parts = label_all(~sky & self.seen.there, connectivity=1)
+        flat, num = parts.ravel(), int(parts.max()) + 1
+        area = np.maximum(np.bincount(flat, minlength=num), 1)
+        red, green, blue = (
+            np.bincount(flat, channel.ravel() / 255.0, num) / area
+            for channel in self.seen.picture.transpose(2, 0, 1)
+        )
         low = np.full(num, np.inf)
-        np.minimum.at(low, parts.ravel(), self.height.ravel())
-        has_points = np.zeros(num, np.bool_)
-        has_points[np.unique(parts[~self.is_bare[seen.labels]])] = True
-        clouds = (bright / area >= _LEAST_CLOUD) & (low > lowest_sky) & ~has_points
+        np.minimum.at(low, flat, self.height.ravel())
+        clouds = (np.maximum(green, blue) >= _LEAST_CLOUD) & (red - blue <= _MOST_WARM)
+        clouds &= low > np.percentile(self.height[sky], _LOW_PERCENT)
         clouds &= area <= _MOST_CLOUD * sky.size
+        clouds &= np.bincount(flat, self.num_points.ravel(), num) <= _MOST_POINTS * area
         clouds[0] = False
         found: Bools = sky | clouds[parts]
         return found

@@ -78,7 +78,7 @@ def in_the_dark(
 
 def _unlit(one: Seen, lamp: tuple[float, float] | None) -> Seen:
     """The view without light beyond the disc, and on what looks away from the lamp."""
-    place = one.view.center + _rays(one.view) * one.depth[..., None].astype(np.float64)
+    place = one.view.center + rays_of(one.view) * one.depth[..., None].astype(np.float64)
     off = (one.what == ON_GROUND) & (np.linalg.norm(place[..., :2], axis=-1) > DISC)
     what, depth = np.where(off, NOTHING, one.what), np.where(off, np.float32(0.0), one.depth)
     black = what == NOTHING
@@ -99,7 +99,7 @@ def _look(angle: float, houses: float, sky: tuple[float, float, float]) -> Seen:
     blank = np.zeros((HEIGHT, WIDTH), np.float32)
     lens = FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2
     view = StereoView(blank, lens, np.column_stack([rotation, eye]))
-    rays = _rays(view)
+    rays = rays_of(view)
     with np.errstate(divide="ignore", invalid="ignore"):
         ground = np.where(rays[..., 2] < 0, -EYE_HEIGHT / rays[..., 2], np.inf)
     pillar = _to_cylinder(eye, rays, RADIUS, TALL)[0]
@@ -118,7 +118,7 @@ def _look(angle: float, houses: float, sky: tuple[float, float, float]) -> Seen:
     return Seen(view, picture, np.where(what == NOTHING, 0.0, depth).astype(np.float32), what)
 
 
-def _rays(view: StereoView) -> Floats:
+def rays_of(view: StereoView) -> Floats:
     """[H, W, 3], world, one along the camera's axis."""
     x, y = ray_grid(view)
     local = np.stack(np.broadcast_arrays(x, y, np.float64(1.0)), axis=-1)

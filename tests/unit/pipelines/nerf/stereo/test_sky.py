@@ -7,13 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipelines.nerf.stereo.sky import Sky, find_sky
+from pipelines.nerf.stereo.sky import Sky, find_sky, like_sky
 from tests.unit.pipelines.nerf.stereo.monument import (
     NUM_VIEWS,
     ON_HOUSES,
     SKY_COLOR,
     UP,
     Seen,
+    rays_of,
     walk_round,
 )
 
@@ -163,6 +164,24 @@ def test_clouds_are_sky_and_birds_and_lamps_are_not() -> None:
     for mask, cloud, lamp in zip(found.masks, clouds, lamps, strict=True):
         assert mask[cloud].mean() > 0.97
         assert mask[lamp].mean() < 0.2
+
+
+@pytest.mark.parametrize(("stone", "num_points"), [((0.85, 0.75, 0.6), 0), ((0.8, 0.82, 0.85), 40)])
+def test_a_tower_that_reaches_into_the_picture_is_no_cloud(
+    stone: tuple[float, float, float], num_points: int
+) -> None:
+    """Sunlit, of sandstone, or of marble with points on it; nothing in the picture carries it."""
+    rng = np.random.default_rng(0)
+    for one in by_day():
+        rows, columns = np.mgrid[: one.picture.shape[0], : one.picture.shape[1]]
+        tower = (rows < 22) & (columns > 104) & one.is_void
+        light = rng.uniform(0.9, 1.1, (*tower.shape, 1)) * np.array(stone)
+        seen = painted(one, tower, light.clip(0.0, 1.0))
+        at = rng.permutation(np.argwhere(tower))[:num_points]
+        points = seen.view.center + 5.0 * rays_of(seen.view)[at[:, 0], at[:, 1]]
+        mask = like_sky(seen.view, seen.picture, UP, points, by_day=True)
+        assert mask[tower].mean() < 0.3
+        assert mask[one.is_void & ~tower].mean() > 0.95
 
 
 def test_a_blue_wall_that_reaches_below_the_horizon_is_no_sky() -> None:
