@@ -56,7 +56,7 @@ def test_a_whole_job_has_every_fixed_key(report: dict[str, Any], job: Workspace)
     assert assets["subject"] == report["stages"]["mesh"]["subject"]
     assert assets["subject"]["kind"] == "subject"
     for warning in report["warnings"]:
-        assert warning["code"] == "geometry_poor"
+        assert warning["code"] in {"geometry_poor", "model_poor"}
     ran = {"ingest", "train", "evaluate", *KINDS, "assess"}
     assert set(report["timings"]) == {f"{name}_s" for name in ran}
     assert all(seconds > 0 for seconds in report["timings"].values())
