@@ -38,7 +38,7 @@ from pipelines.judging.depth_scores import (
     fitted_scale,
     nearest,
 )
-from pipelines.judging.geometry_gate import Limits, geometry_warning, model_warning
+from pipelines.judging.verdicts import Limits, geometry_warning, model_warning
 from pipelines.nerf.data.images import ImageData, load_images
 from pipelines.nerf.data.light import in_the_light_of
 from pipelines.nerf.judging.off_path import evenly

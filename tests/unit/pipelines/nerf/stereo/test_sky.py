@@ -127,14 +127,18 @@ def by_day(above: np.ndarray = ZENITH, houses: float = 7.0) -> list[Seen]:
     return [painted(one, one.is_void, np.broadcast_to(slope, one.picture.shape)) for one in seen]
 
 
-def test_a_blue_sky_is_known_without_anything_far_behind() -> None:
-    seen = by_day()
-    assert np.std(seen[0].picture[seen[0].is_void] / 255.0, axis=0).max() > 0.06
-    found = sky_of(seen)
+def assert_known_by_day(found: Sky, seen: list[Seen]) -> None:
     assert found.by_day
     for one, mask in zip(seen, found.masks, strict=True):
         assert mask[one.is_void].mean() > 0.97
         assert mask[~one.is_void].mean() < 0.01
+
+
+def test_a_blue_sky_is_known_without_anything_far_behind() -> None:
+    seen = by_day()
+    assert np.std(seen[0].picture[seen[0].is_void] / 255.0, axis=0).max() > 0.06
+    found = sky_of(seen)
+    assert_known_by_day(found, seen)
 
 
 def test_by_day_some_pictures_show_it_white() -> None:
@@ -142,10 +146,7 @@ def test_by_day_some_pictures_show_it_white() -> None:
     white = np.array([0.99, 1.0, 1.0])
     seen = [painted(one, one.is_void, white) if i > 5 else one for i, one in enumerate(by_day())]
     found = sky_of(seen)
-    assert found.by_day
-    for one, mask in zip(seen, found.masks, strict=True):
-        assert mask[one.is_void].mean() > 0.97
-        assert mask[~one.is_void].mean() < 0.01
+    assert_known_by_day(found, seen)
 
 
 def test_clouds_are_sky_and_birds_and_lamps_are_not() -> None:

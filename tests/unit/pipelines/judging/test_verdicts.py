@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.judging.geometry_gate import Limits, geometry_warning, model_warning
+from pipelines.judging.verdicts import Limits, geometry_warning, model_warning
 from pipelines.options import AssessOptions
 
 DEFAULTS = AssessOptions()
