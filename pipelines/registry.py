@@ -114,7 +114,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="train",
-        version=9,
+        version=10,
         after=("depth",),
         reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.train:run",

@@ -24,6 +24,7 @@ from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.errors import TrainingError
 from pipelines.nerf.data.depth_maps import DepthMaps
 from pipelines.nerf.data.images import ImageData, load_images, split_indices
+from pipelines.nerf.data.plain_share import unknown_plain_share
 from pipelines.nerf.devices import choose_device
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.models.base import Model
@@ -38,7 +39,6 @@ from pipelines.option_models import StageOptions
 from pipelines.options import resolve_options, stage_options, train_config
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsFile
-from pipelines.scene.gaze import gaze_of, told_by_cameras
 from pipelines.scene.natural_order import natural_key
 from pipelines.scene.trained_scene import (
     as_uint8,
@@ -52,9 +52,9 @@ _PREVIEW_LONG_SIDE = 320
 _PSNR_STEPS = 50
 _CHECKPOINT, _PROGRESS = "training.pt", "progress.json"
 _TRAIN_SHARE = 0.98
-_ALL_ROUND_DEG = 120.0
-"""Between the directions of two cameras, for plain lines: of what is seen from one side what the
-maps mistake at the rims of things goes on into all that is plain (docs/surfaces.md)."""
+_LEAST_UNKNOWN = 0.36
+"""Of what is plain, that no map knows, for plain lines: where maps know the most of it, what they
+mistake at the rims of things goes on into the rest (docs/surfaces.md)."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         _compile_kernels(config, ctx)
         ctx.progress(0.0, "loading images")
         inputs = _load(config, ctx)
-        config = decided(config, inputs.capture)
+        unknown = _unknown(config, inputs)
+        config = decided(config, unknown)
         watcher = _Watcher(inputs, ctx)
         model = _train(inputs, config, ctx, watcher)
     ctx.progress(_TRAIN_SHARE, "saving the model")
@@ -106,20 +107,32 @@ def run(options: StageOptions, ctx: StageContext) -> dict[str, Any]:
         "device": device.type,
         "engine": model.engine,
         "warnings": engine_warnings(config, device, model.engine),
+        "plain_unknown": unknown,
         "plain_lines": config.flat.when == "always",
         "camera_deltas": deltas,
     }
 
 
-def decided(config: TrainConfig, capture: CamerasFile) -> TrainConfig:
-    """The run with what is to be decided by how the capture was filmed."""
-    if config.flat.when != "around":
+def decided(config: TrainConfig, unknown: float | None) -> TrainConfig:
+    """The run with what is to be decided by the capture.
+
+    unknown: share of what is plain in its pictures that depth maps do not know; None where the
+    options decide.
+    """
+    if unknown is None:
         return config
-    shown = [image for image in capture.images if image.split == "train"]
-    told = told_by_cameras(gaze_of(shown, [capture.cameras[image.camera] for image in shown]))
-    around = told.why is None and told.measures["arc_deg"] >= _ALL_ROUND_DEG
-    when = "always" if around else "never"
+    when = "always" if unknown >= _LEAST_UNKNOWN else "never"
     return replace(config, flat=replace(config.flat, when=when))
+
+
+def _unknown(config: TrainConfig, inputs: _Inputs) -> float | None:
+    """What `decided` is to be told."""
+    if config.flat.when != "unknown" or config.flat.weight == 0.0:
+        return None
+    found = unknown_plain_share(
+        inputs.images, inputs.train, inputs.cameras, inputs.depth, config.flat
+    )
+    return round(found, 3)
 
 
 def engine_warnings(config: TrainConfig, device: torch.device, engine: str) -> list[dict[str, Any]]:

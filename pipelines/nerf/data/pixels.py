@@ -14,17 +14,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pipelines.nerf.data.color_steps import LEVELS_PER_STEP, steps_of
 from pipelines.nerf.data.images import ImageData
 from pipelines.nerf.data.plain_lines import PER_LINE, PlainLines
 from pipelines.nerf.errors import NerfError
-from pipelines.nerf.options.train import DataConfig
+from pipelines.nerf.options.train import DataConfig, FlatLossConfig
 
 BLOCK_PIXELS = 64
 """Pixels of a mask that are counted together, so that its usable pixels need no list of their own:
 the counts take 3/8 of a byte a pixel, where positions would take 8."""
 
-_LOOKS, _SHORTEST_PX = 10, 3.0
-"""Colours looked at along a line, the rays' among them; half of a line is no shorter."""
+_LOOKS, _SHORTEST_PX = 34, 3.0
+"""Places looked at along a line, the rays' among them; half of a line is no shorter."""
 
 
 class Batch(NamedTuple):
@@ -32,8 +33,8 @@ class Batch(NamedTuple):
     ones and so on; then single ones.
 
     position: [B] int64. pixels: [B, 2] float32, centres, x and y. colors: [B, 3] in [0, 1]. plain:
-    [L] in [0, 1], how even the colours along each line are; 0 of one that would leave its picture
-    or its mask.
+    [L] in [0, 1], how free of steps the colours along each line are; 0 of one that would leave its
+    picture or its mask.
     """
 
     position: Tensor
@@ -90,6 +91,7 @@ class PixelSampler:
         self._widths, self._heights = images.sizes[rows].to(self.device).unbind(-1)
         self._ends = counts.cumsum(0).to(self.device)
         self._firsts = self._ends - counts.to(self.device)
+        self._steps = None if lines is None else self._color_steps(images, rows, lines.config.reach)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """(positions [B] int64, pixel centres [B, 2] float32 x and y, colours [B, 3] in [0, 1])."""
@@ -103,10 +105,9 @@ class PixelSampler:
         """The pixels of a training step, `count` of them, on lines and single ones as of `draw`."""
         num_lines = 0 if self.lines is None else self.lines.count(count)
         position, pixels, colors = self.draw(count - PER_LINE * num_lines, generator)
-        if self.lines is None or num_lines == 0:
+        if self.lines is None or self._steps is None or num_lines == 0:
             return Batch(position, pixels, colors, pixels.new_zeros(0))
-        config = self.lines.config
-        lined = self._draw_lines(num_lines, config.reach, config.contrast, generator)
+        lined = self._draw_lines(num_lines, self.lines.config, self._steps, generator)
         return Batch(
             torch.cat([lined.position, position]),
             torch.cat([lined.pixels, pixels]),
@@ -134,18 +135,18 @@ class PixelSampler:
         return self._pixels[self._rows_of(position, places)].float() / 255.0
 
     def _draw_lines(
-        self, count: int, reach: float, contrast: float, generator: torch.Generator
+        self, count: int, config: FlatLossConfig, color_steps: Tensor, generator: torch.Generator
     ) -> Batch:
         """Lines of four pixels at equal distances: around a usable one, of a random length and
         direction. One that would leave its picture, or its mask, shrinks to that pixel.
 
-        reach, contrast: as of the options. A line's colours are compared with those that lie
-        straight between its ends, p = exp(-(largest difference / contrast)^2).
+        p = exp(-(s / contrast)^2), s the highest step of colour along the line; color_steps: [P],
+        those of all pixels (`data.color_steps`).
         """
         position, x, y = self._pick(count, generator)
         middle = torch.stack([x, y], dim=-1)
         size = torch.stack([self._widths[position], self._heights[position]], dim=-1)
-        longest = (size.amax(dim=-1) * reach / _SHORTEST_PX).clamp_min(1.0)
+        longest = (size.amax(dim=-1) * config.reach / _SHORTEST_PX).clamp_min(1.0)
         drawn = torch.rand(2, count, generator=generator, device=self.device)
         length, angle = _SHORTEST_PX * longest ** drawn[0], math.pi * drawn[1]
         third = torch.stack([angle.cos(), angle.sin()], dim=-1) * (length / 3.0)[:, None]
@@ -159,17 +160,26 @@ class PixelSampler:
         if self._usable is not None:
             usable = inside & self._usable.valid[self._rows_of(everywhere, places)].all(dim=1)
             places = torch.where(usable[:, None, None], places, middle[:, None])
-        seen = self._colors_at(everywhere, places)
-        even = seen[:, :1] * (1.0 - share) + seen[:, -1:] * share
-        stray = (seen - even).abs().amax(dim=(1, 2)) / contrast
-        on_line = slice(None, None, (_LOOKS - 1) // (PER_LINE - 1))
-        pixels, colors = (item[:, on_line].transpose(0, 1).flatten(0, 1) for item in (places, seen))
+        steps = color_steps[self._rows_of(everywhere, places)].amax(dim=1)
+        uneven = steps.float() / (LEVELS_PER_STEP * config.contrast)
+        pixels = places[:, :: (_LOOKS - 1) // (PER_LINE - 1)].transpose(0, 1).flatten(0, 1)
+        positions = position.repeat(PER_LINE)
         return Batch(
-            position.repeat(PER_LINE),
+            positions,
             pixels.float() + 0.5,
-            colors,
-            torch.where(usable, torch.exp(-stray.square()), 0.0),
+            self._colors_at(positions, pixels),
+            torch.where(usable, torch.exp(-uneven.square()), 0.0),
         )
+
+    def _color_steps(self, images: ImageData, rows: Tensor, reach: float) -> Tensor:
+        """[P] uint8, as `self._pixels`; of the images that are drawn from, 0 of others."""
+        found = torch.zeros(len(self._pixels), dtype=torch.uint8, device=self.device)
+        for index in rows.tolist():
+            picture = images.image(index).to(self.device)
+            spacing = 2.0 * reach * max(picture.shape[:2]) / (_LOOKS - 1)
+            start, end = images.offsets[index : index + 2].tolist()
+            found[start:end] = steps_of(picture, spacing).flatten()
+        return found
 
     def _block_means(self, position: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Mean centre [B, 2] and colour [B, 3] of the usable pixels in the squares around pixels.

@@ -66,7 +66,12 @@ class PlainLines:
         turn = cameras.scene_from_camera[rays.camera_indices[:num_rays], :, :3]
         local = torch.einsum("rij,ri->rj", turn, rays.directions[:num_rays])
         if maps is not None:
-            known = maps.distances(rays, cameras)[:num_rays].reshape(PER_LINE, -1) > 0.0
-            plain = torch.where(known[1:-1].all(dim=0), 0.0, plain)
+            plain = torch.where(are_known(maps.distances(rays, cameras)[:num_rays]), 0.0, plain)
         given = found[:num_rays], edges[:num_rays], local, plain
         return weight * bend_loss(*given, self.config.curve, self.config.limit)
+
+
+def are_known(distances: Tensor) -> Tensor:
+    """[L] bool: whether maps know both inner rays of a line. distances: [4 L], 0 where unknown."""
+    known: Tensor = (distances.reshape(PER_LINE, -1)[1:-1] > 0.0).all(dim=0)
+    return known

@@ -107,11 +107,10 @@ class FlatLossConfig:
     """
 
     when: str = option(
-        "around",
-        "around: where the cameras stand around what they look at, by the rule for subjects, and "
-        "two of them 120 degrees apart; the library alone, which does not know that, takes it for "
-        "never.",
-        choices=("around", "always", "never"),
+        "unknown",
+        "unknown: where depth maps leave out a third of what is plain in the pictures, and more; "
+        "the library alone takes it for never.",
+        choices=("unknown", "always", "never"),
     )
     weight: float = option(
         0.2,
@@ -127,7 +126,7 @@ class FlatLossConfig:
         0.1, "Longest half of a line, as a part of the picture's long side.", ge=0.001, le=0.5
     )
     contrast: float = option(
-        0.03, "How far colours of a plain line stray from even shading, in [0, 1].", ge=1e-3, le=1.0
+        0.015, "Step of colour, in [0, 1], from which a line is plain no longer.", ge=1e-3, le=1.0
     )
     limit: float = option(
         0.02,
