@@ -17,6 +17,8 @@ LEVELS_PER_STEP = 1000.0
 _SIDE_PER_SIGMA, _LEAST_SIGMA_PX = 320.0, 1.0
 """Long side of a picture, in standard deviations of what it is smoothed by: 1.5 pixels of 480."""
 _REACH_SIGMAS = 3.0
+_FINE_SIGMA_PX = 1.25
+"""Pictures are reduced, by means of blocks, as far as leaves the smoothing so wide."""
 _PLAINEST, _NOISE_SPAN, _MOST_NOISE = 0.1, 3.0, 0.005
 """What the plainest tenth of a picture shows is noise, unless it is more than a camera's; along a
 line noise goes up to some times that."""
@@ -33,13 +35,31 @@ def steps_of(picture: Tensor, spacing_px: float = 1.0) -> Tensor:
     """
     height, width = picture.shape[:2]
     sigma = max(max(height, width) / _SIDE_PER_SIGMA, _LEAST_SIGMA_PX)
+    block = max(1, int(sigma / _FINE_SIGMA_PX))
+    colors = picture.permute(2, 0, 1)[:, None].float()
+    colors = torch.nn.functional.avg_pool2d(colors, block, ceil_mode=True)
+    gradient = _gradient(colors, sigma / block)
+    step = gradient.amax(dim=0) * (math.sqrt(2.0 * math.pi) * sigma / block)
+    noise = step.flatten().kthvalue(1 + int(_PLAINEST * (step.numel() - 1))).values
+    step = (step - _NOISE_SPAN * noise.clamp_max(_MOST_NOISE)).clamp_min(0.0)
+    half = math.ceil((int(spacing_px / 2.0) - block // 2) / block)
+    if half > 0:
+        for side in ((2 * half + 1, 1), (1, 2 * half + 1)):
+            around = (side[0] // 2, side[1] // 2)
+            step = torch.nn.functional.max_pool2d(step, side, stride=1, padding=around)
+    step = (step[0] * LEVELS_PER_STEP).round().clamp_max(255.0).to(torch.uint8)
+    whole = step.repeat_interleave(block, dim=0).repeat_interleave(block, dim=1)
+    return whole[:height, :width]
+
+
+def _gradient(colors: Tensor, sigma: float) -> Tensor:
+    """[3, 1, H, W], per pixel, of colours [3, 1, H, W] smoothed by a Gaussian."""
     reach = math.ceil(_REACH_SIGMAS * sigma)
-    offset = torch.arange(-reach, reach + 1, dtype=torch.float32, device=picture.device)
+    offset = torch.arange(-reach, reach + 1, dtype=torch.float32, device=colors.device)
     smooth = torch.exp(-0.5 * (offset / sigma).square())
     smooth = smooth / smooth.sum()
-    slope = offset / sigma**2 * smooth
+    slope = offset * smooth
     slope = slope / (slope * offset).sum()  # of a ramp exactly its slope
-    colors = picture.permute(2, 0, 1)[:, None].float()
     # Borders repeat the outermost pixels.
     padded = torch.nn.functional.pad(colors, (reach, reach, reach, reach), mode="replicate")
 
@@ -47,10 +67,4 @@ def steps_of(picture: Tensor, spacing_px: float = 1.0) -> Tensor:
         rows = torch.nn.functional.conv2d(padded, across[None, None, None, :])
         return torch.nn.functional.conv2d(rows, down[None, None, :, None])
 
-    gradient = torch.hypot(filtered(slope, smooth), filtered(smooth, slope))
-    step = gradient.amax(dim=0) * (math.sqrt(2.0 * math.pi) * sigma)
-    noise = step.flatten().kthvalue(1 + int(_PLAINEST * (step.numel() - 1))).values
-    step = (step - _NOISE_SPAN * noise.clamp_max(_MOST_NOISE)).clamp_min(0.0)
-    half = int(spacing_px / 2.0)
-    step = torch.nn.functional.max_pool2d(step, 2 * half + 1, stride=1, padding=half)
-    return (step[0] * LEVELS_PER_STEP).round().clamp_max(255.0).to(torch.uint8)
+    return torch.hypot(filtered(slope, smooth), filtered(smooth, slope))

@@ -77,3 +77,13 @@ def test_a_larger_picture_of_the_same_has_the_same_steps() -> None:
     small[:, 160:] += 0.06
     large = small.repeat_interleave(3, dim=0).repeat_interleave(3, dim=1)
     assert float(found(large).max()) == pytest.approx(float(found(small).max()), rel=0.1)
+
+
+def test_a_picture_is_as_large_as_before_where_blocks_do_not_fit() -> None:
+    picture = torch.full((301, 1003, 3), 0.5)  # blocks of two pixels
+    picture[:, 500:] += 0.06
+    steps = found(picture, spacing_px=6.0)
+    assert steps.shape == (301, 1003)
+    for first in range(6):
+        assert float(steps[:, first::6].amax(dim=1).min()) == pytest.approx(0.06, rel=0.15)
+    assert float(steps[:, :480].max()) == float(steps[:, 520:].max()) == 0.0
