@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
 
 from pipelines.nerf.options.parts import allowed_names
 from pipelines.nerf.options.train import TrainConfig, default_train_config
@@ -39,6 +41,8 @@ def _field_of(
     if "choices" in meta:
         annotation = Literal[allowed_names(meta)]
         bounds = {}
+        if "former" in meta:
+            annotation = Annotated[annotation, BeforeValidator(partial(_present, meta["former"]))]
     elif typing.get_origin(annotation) is tuple:
         (item, *_) = typing.get_args(annotation)
         item_model = model_of(item) if dataclasses.is_dataclass(item) else item
@@ -52,6 +56,11 @@ def _field_of(
     if default is not None:
         return annotation, Field(default_factory=lambda: default, description=description, **bounds)
     return annotation, Field(default=field.default, description=description, **bounds)
+
+
+def _present(former: Mapping[str, str], name: Any) -> Any:
+    """The name that a choice has now, of one that older versions knew."""
+    return former.get(name, name) if isinstance(name, str) else name
 
 
 def _plain(value: Any) -> Any:

@@ -14,7 +14,10 @@ from pipelines.nerf.plugins import plugin_components
 
 
 def option(default: Any, help: str, **bounds: Any) -> Any:
-    """A dataclass field with its meaning; `bounds`: unit, ge, le, choices, plugins."""
+    """A dataclass field with its meaning; `bounds`: unit, ge, le, choices, plugins, former.
+
+    former: names that older versions had for some of the choices, as stored jobs still say them.
+    """
     return field(default=default, metadata={"help": help, **bounds})
 
 

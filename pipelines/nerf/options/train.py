@@ -111,6 +111,7 @@ class FlatLossConfig:
         "unknown: where depth maps leave out a third of what is plain in the pictures, and more; "
         "the library alone takes it for never.",
         choices=("unknown", "always", "never"),
+        former={"around": "unknown"},
     )
     weight: float = option(
         0.2,

@@ -12,6 +12,7 @@ from pipelines.options import (
     STAGE_OPTIONS,
     OptionsError,
     resolve_options,
+    revise_options,
     stage_options,
     stages_skipped,
     train_config,
@@ -111,3 +112,14 @@ def test_previews_rate_falls_to_nothing_at_the_runs_end_however_long_that_is(
     )
     assert last < 1e-3 * first
     assert 0.4 * first < middle < 0.6 * first
+
+
+def test_a_job_that_an_older_version_stored_still_has_its_options() -> None:
+    """`around` was the default until it was `unknown`: such jobs wait and are retried."""
+    resolved = resolve_options("preview", {})
+    stored = {**resolved["train"], "flat": {**resolved["train"]["flat"], "when": "around"}}
+    assert train_config(stage_options("train", stored)).flat.when == "unknown"
+    assert revise_options("preview", {**resolved, "train": stored}, {}) == resolved
+    for wrong in ("aroundd", ["around"], None):
+        with pytest.raises(OptionsError, match=r"train\.flat\.when"):
+            resolve_options("preview", {"train": {"flat": {"when": wrong}}})
