@@ -61,6 +61,13 @@ class IngestOptions(StageOptions):
         "around the horizon, 5 with the one upwards, 6 with the one downwards, where mostly the "
         "camera's bearer is.",
     )
+    masks: Literal["auto", "cut_out", "ignore", "off"] = Field(
+        "auto",
+        description="What is meant by masks that lie beside photos under their names, white where "
+        "the photo counts: cut_out leaves the thing that is white and nothing around it, ignore "
+        "passes over what is black, off passes over the masks. auto takes them for cut-outs where "
+        "there is black all around. Masks that a capture's poses name always hide what is black.",
+    )
 
 
 class FramesOptions(StageOptions):

@@ -45,7 +45,7 @@ _EXPLAINS = "pipelines.stages.check:write_failed_check"
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=10,
+        version=11,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",
@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=14,
+        version=15,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",

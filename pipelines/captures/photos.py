@@ -11,6 +11,7 @@ from pipelines.captures.contents import Photos
 from pipelines.captures.minimum import MIN_IMAGES
 from pipelines.captures.panorama_files import EQUIRECTANGULAR, FOLDER, write_views
 from pipelines.captures.photo_choice import choose_photos
+from pipelines.captures.photo_masks import PhotoMasks, find_masks
 from pipelines.captures.pictures import Picture, PictureWriter
 from pipelines.captures.record import Found
 from pipelines.captures.storing import store_each
@@ -35,10 +36,11 @@ def write_photos(
     Raises CaptureError: no_images where none is, and as `storing.store_each` does.
     """
     names = choose_photos(archive, capture.names, options.max_pixels, ctx)
+    masks = find_masks(archive, names, options.masks, options.max_pixels, ctx)
     pictures, warnings = store_each(
         archive,
         [_Photo(name) for name in sorted(names, key=natural_key)],
-        partial(_store, ctx.out, options),
+        partial(_store, ctx.out, options, masks),
         options,
         ctx,
         upright=True,
@@ -47,15 +49,28 @@ def write_photos(
     sizes = sorted({(picture.width, picture.height) for picture in pictures})
     return Found(
         images=[picture.as_dict() for picture in pictures],
-        details={"num_sizes": len(sizes), "largest": list(max(sizes))},
+        details={
+            "num_sizes": len(sizes),
+            "largest": list(max(sizes)),
+            **({} if masks is None else masks.details()),
+        },
         warnings=warnings,
     )
 
 
 def _store(
-    out: Path, options: IngestOptions, writer: PictureWriter, photo: _Photo, number: int
+    out: Path,
+    options: IngestOptions,
+    masks: PhotoMasks | None,
+    writer: PictureWriter,
+    photo: _Photo,
+    number: int,
 ) -> Picture:
-    picture = writer.store(photo.name, number)
+    if masks is None:
+        picture = writer.store(photo.name, number)
+    else:
+        masks.check(photo.name)
+        picture = writer.store(photo.name, number, masks.of.get(photo.name), masks.meaning)
     told = options.projection == EQUIRECTANGULAR
     if options.projection == "flat" or not (told or picture.projection == EQUIRECTANGULAR):
         return picture
@@ -68,8 +83,10 @@ def _store(
             code="image_undecodable",
             hint="Leave the picture out, or set ingest.projection to auto.",
         )
+    if picture.mask is not None:
+        (out / picture.mask).unlink()
     (out / FOLDER).mkdir(exist_ok=True)
     panorama = f"{FOLDER}/{picture.file.rpartition('/')[2]}"
     (out / picture.file).rename(out / panorama)
     views = write_views(out / panorama, out, f"{number:05d}", options.panorama_views)
-    return replace(picture, file=panorama, views=tuple(views))
+    return replace(picture, file=panorama, views=tuple(views), mask=None)

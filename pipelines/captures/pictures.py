@@ -8,7 +8,7 @@ with poses are not, since their intrinsics speak of the pixels as stored.
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from pipelines.captures.color_profiles import in_srgb
 from pipelines.captures.decoders import DAMAGED, open_picture
 from pipelines.captures.exif import Exif, read_exif
 from pipelines.captures.panorama_files import photo_projection
+from pipelines.captures.photo_masks import Meaning, cut_out, fitted
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 
@@ -34,7 +35,8 @@ class Picture:
     """A picture as written.
 
     file: relative to the stage's folder. source: its name as sent. projection: as its XMP names it,
-    "" for a plain view. views: files of those that were cut from it, where it is a panorama.
+    "" for a plain view. views: files of those that were cut from it, where it is a panorama. mask:
+    file of a one-channel picture of its size, black where it is to be ignored, or None.
     """
 
     file: str
@@ -44,6 +46,7 @@ class Picture:
     exif: Exif
     projection: str = ""
     views: tuple[str, ...] = ()
+    mask: str | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain JSON, for `capture.json`."""
@@ -54,6 +57,7 @@ class Picture:
             "height": self.height,
             "exif": self.exif.as_dict(),
             **({"views": list(self.views)} if self.views else {}),
+            **({"mask": self.mask} if self.mask else {}),
         }
 
 
@@ -90,37 +94,80 @@ class PictureWriter:
         if not any((self._out / "masks").iterdir()):
             (self._out / "masks").rmdir()
 
-    def store(self, name: str, number: int) -> Picture:
+    def store(
+        self, name: str, number: int, mask: str | None = None, meaning: Meaning = "ignore"
+    ) -> Picture:
         """Decode the picture `name` and write it as `images/<number>`.
 
+        mask: the one in the archive that lies beside it (`pipelines.captures.photo_masks`), or
+        None; by its meaning the picture is cut out, or the mask is written as `masks/<number>`.
         Raises CaptureError image_undecodable.
         """
         kind = self._archive.image_format(name)
         self._archive.extract(name, self._raw)
-        return self._store(self._raw, kind, name, number)
+        with self._opened(self._raw, name, kind) as image:
+            if mask is None:
+                return self._store(image, self._raw, kind, name, number)
+            beside = self._mask_beside(mask, name, image)
+            if meaning == "cut_out":
+                return self._store(image, self._raw, kind, name, number, beside)
+            picture = self._store(image, self._raw, kind, name, number)
+            return replace(picture, mask=self._write_mask(beside, number))
 
     def store_frame(self, path: Path, label: str, number: int) -> Picture:
         """Write a JPEG that was decoded from a film, as `store` does. label: what it is called."""
-        return self._store(path, "JPEG", label, number)
+        with self._opened(path, label, "JPEG") as image:
+            return self._store(image, path, "JPEG", label, number)
 
-    def _store(self, raw: Path, kind: str, name: str, number: int) -> Picture:
-        with self._opened(raw, name, kind) as image:
-            exif = read_exif(image)
-            projection = photo_projection(image)
-            turned = self._upright and exif.orientation not in (None, 1)
-            suffix = ".png" if kind == "PNG" else ".jpg"
-            file = f"images/{number:05d}{suffix}"
-            target = self._out / file
-            if not turned and _is_clean(image, raw):
-                shutil.copyfile(raw, target)
-                return Picture(file, name, image.width, image.height, exif, projection)
-            upright = PIL.ImageOps.exif_transpose(image) if turned else image
-            plain = _plain_rgb(self._in_srgb(_eight_bit(upright), name))
-            if suffix == ".png":
-                plain.save(target, "PNG", compress_level=3)
-            else:
-                plain.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-            return Picture(file, name, plain.width, plain.height, exif, projection)
+    def _store(
+        self,
+        image: PIL.Image.Image,
+        raw: Path,
+        kind: str,
+        name: str,
+        number: int,
+        cut_by: PIL.Image.Image | None = None,
+    ) -> Picture:
+        """Write an open picture. raw: its file. cut_by: white beyond which it is to be white."""
+        exif = read_exif(image)
+        projection = photo_projection(image)
+        turned = self._upright and exif.orientation not in (None, 1)
+        suffix = ".png" if kind == "PNG" else ".jpg"
+        file = f"images/{number:05d}{suffix}"
+        target = self._out / file
+        if not turned and cut_by is None and _is_clean(image, raw):
+            shutil.copyfile(raw, target)
+            return Picture(file, name, image.width, image.height, exif, projection)
+        upright = PIL.ImageOps.exif_transpose(image) if turned else image
+        plain = _plain_rgb(self._in_srgb(_eight_bit(upright), name))
+        if cut_by is not None:
+            plain = cut_out(plain, cut_by)
+        if suffix == ".png":
+            plain.save(target, "PNG", compress_level=3)
+        else:
+            plain.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+        return Picture(file, name, plain.width, plain.height, exif, projection)
+
+    def _mask_beside(self, mask: str, name: str, image: PIL.Image.Image) -> PIL.Image.Image:
+        """A mask that lies beside the picture `name`, as that is written. image: as it was sent.
+
+        Raises CaptureError image_undecodable.
+        """
+        path = self._out / ".mask"
+        self._archive.extract(mask, path)
+        try:
+            with self._opened(path, mask, self._archive.image_format(mask)) as opened_mask:
+                turn = read_exif(image).orientation
+                found = fitted(opened_mask, image.size, turn, upright=self._upright)
+        finally:
+            path.unlink(missing_ok=True)
+        if found is None:
+            raise CaptureError(
+                f'The mask "{shown(mask)}" has another shape than "{shown(name)}".',
+                code="image_undecodable",
+                hint="Masks must have the shape of their pictures; ingest.masks=off leaves them.",
+            )
+        return found
 
     @property
     def warnings(self) -> list[str]:
@@ -145,10 +192,12 @@ class PictureWriter:
                     code="image_undecodable",
                     hint="Masks must have the size of their pictures.",
                 )
-            file = f"masks/{number:05d}.png"
-            PIL.Image.frombytes("L", image.size, image.convert("L").tobytes()).save(
-                self._out / file
-            )
+            return self._write_mask(image, number)
+
+    def _write_mask(self, mask: PIL.Image.Image, number: int) -> str:
+        """Write a mask without what its file said beside it; returns its path below `out`."""
+        file = f"masks/{number:05d}.png"
+        PIL.Image.frombytes("L", mask.size, mask.convert("L").tobytes()).save(self._out / file)
         return file
 
     def _in_srgb(self, image: PIL.Image.Image, name: str) -> PIL.Image.Image:

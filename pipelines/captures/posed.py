@@ -5,6 +5,7 @@ World frame: +Z up. Camera frame: OpenGL (+X right, +Y up, looks along -Z).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,6 +18,7 @@ from pipelines.captures.depth_files import DepthWriter
 from pipelines.captures.films import FilmFrames
 from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.captures.parsing import malformed
+from pipelines.captures.photo_masks import PhotoMasks, find_masks
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
 from pipelines.captures.pose_order import proven
 from pipelines.captures.record import Found, FoundPoints
@@ -75,12 +77,13 @@ def write_posed(
         sources, num_passed_over = [sources[index] for index in picked], len(left)
     depths = DepthWriter(archive, ctx.out, max_pixels=options.max_pixels)
     film = FilmFrames(archive, ctx.out, max_pixels=options.max_pixels)
+    beside = _masks_beside(archive, sources, options, ctx)
     try:
         film.decode(sources, capture.num_film_frames, ctx)
         stored, warnings = store_each(
             archive,
             sources,
-            partial(_store, depths, film),
+            partial(_store, depths, film, beside),
             options,
             ctx,
             upright=False,
@@ -126,6 +129,7 @@ def write_posed(
             "num_lenses": len(cameras),
             "num_depths": sum(image.depth is not None for image in images),
             "metric": capture.metric,
+            **({} if beside is None else beside.details()),
             **capture.details,
         },
         warnings=[
@@ -139,9 +143,24 @@ def write_posed(
     )
 
 
+def _masks_beside(
+    archive: CaptureArchive,
+    sources: Sequence[PosedSource],
+    options: IngestOptions,
+    ctx: StageContext,
+) -> PhotoMasks | None:
+    """Masks that lie beside the pictures where the poses name none, of pictures without a sensor's
+    depth: that knows what the phone saw around a thing, too."""
+    if any(item.mask or item.depth or item.frame is not None for item in sources):
+        return None
+    names = list(dict.fromkeys(item.name for item in sources))
+    return find_masks(archive, names, options.masks, options.max_pixels, ctx)
+
+
 def _store(
     depths: DepthWriter,
     film: FilmFrames,
+    beside: PhotoMasks | None,
     writer: PictureWriter,
     source: PosedSource,
     number: int,
@@ -153,12 +172,16 @@ def _store(
     what = f'"{shown(source.label)}"'
     pose = checked_pose(np.array(source.world_from_camera, np.float64), what)
     if source.frame is None:
-        picture = writer.store(source.name, number)
+        if beside is None:
+            picture = writer.store(source.name, number)
+        else:
+            beside.check(source.name)
+            picture = writer.store(source.name, number, beside.of.get(source.name), beside.meaning)
     else:
         picture = writer.store_frame(film.file(source), source.label, number)
     size = (picture.width, picture.height)
     lens = checked_lens(source.lens(picture.width, picture.height), what)
-    mask = None
+    mask = picture.mask
     if source.mask is not None:
         mask = writer.store_mask(source.mask, number, size)
     depth, depth_lens = None, None

@@ -102,6 +102,20 @@ def undistorted_picture(
     return shown
 
 
+def unhidden(
+    root: Path, image: PosedImage, lens: Intrinsics, pinhole: Pinhole
+) -> NDArray[np.bool_] | None:
+    """What the image's mask does not hide, as that pinhole sees it, [H, W]; None without a mask.
+
+    root: what the image's paths are relative to.
+    """
+    if image.mask is None:
+        return None
+    there = np.ones((pinhole.height, pinhole.width), np.float32)
+    shown: NDArray[np.bool_] = _undistorted(_unmasked(there, root, image), lens, pinhole) > 0.0
+    return shown
+
+
 def sensor_depth(
     root: Path, image: PosedImage, lens: Intrinsics, pinhole: Pinhole
 ) -> NDArray[np.float32] | None:

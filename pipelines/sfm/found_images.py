@@ -25,6 +25,7 @@ class FoundImages:
     files, timestamps_s: as in `Source`. cameras: their lenses. camera_of: [N], index into
     `cameras`. world_from_camera: [N, 3, 4] float64. up: N, the direction away from gravity in
     OpenGL camera axes (+X right, +Y up, looks along -Z) where the device measured it, else None.
+    masks: N files, black where an image is to be ignored, or None.
     """
 
     files: tuple[str, ...]
@@ -33,6 +34,7 @@ class FoundImages:
     camera_of: tuple[int, ...]
     world_from_camera: npt.NDArray[np.float64]
     up: tuple[Sequence[float] | None, ...]
+    masks: tuple[str | None, ...]
 
 
 def found_images(model: SparseModel, source: Source) -> FoundImages:
@@ -43,6 +45,7 @@ def found_images(model: SparseModel, source: Source) -> FoundImages:
     camera_of: list[int] = []
     poses: list[npt.NDArray[np.float64]] = []
     up: list[Sequence[float] | None] = []
+    masks: list[str | None] = []
     for index, camera, pose in zip(
         model.indices, model.camera_of, model.world_from_camera, strict=True
     ):
@@ -53,6 +56,13 @@ def found_images(model: SparseModel, source: Source) -> FoundImages:
         times += [source.timestamps_s[index]] * num
         camera_of += [camera] * num
         up += [None if views else source.up_of(index)] * num
+        masks += [None if views else source.mask_of(index)] * num
     return FoundImages(
-        tuple(files), tuple(times), lenses, tuple(camera_of), np.stack(poses), tuple(up)
+        tuple(files),
+        tuple(times),
+        lenses,
+        tuple(camera_of),
+        np.stack(poses),
+        tuple(up),
+        tuple(masks),
     )

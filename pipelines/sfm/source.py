@@ -41,7 +41,8 @@ class Source:
     clips: of a film, the clip that each frame is of, ascending; neighbours of one clip only are
     neighbours in time. views: for each image the views that were cut from it, none of one that is
     no panorama; of a capture without panoramas nothing at all. clip_names: what the sender called
-    each clip, by its number.
+    each clip, by its number. masks: as `files`, black where an image is to be ignored, None for
+    those without; nothing at all of a capture without masks.
     """
 
     root: Path
@@ -52,6 +53,7 @@ class Source:
     clips: tuple[int, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
     clip_names: tuple[str, ...] = ()
+    masks: tuple[str | None, ...] = ()
 
     @property
     def has_panoramas(self) -> bool:
@@ -83,6 +85,15 @@ class Source:
         """Where the images lie on this machine."""
         return [self.root / file for file in self.files]
 
+    def mask_of(self, index: int) -> str | None:
+        """The file of an image's mask, or None."""
+        return self.masks[index] if self.masks else None
+
+    @property
+    def mask_paths(self) -> dict[int, Path]:
+        """Where the masks lie on this machine, by the indices of their images."""
+        return {i: self.root / mask for i, mask in enumerate(self.masks) if mask is not None}
+
 
 def read_source(workspace: Workspace) -> Source:
     """The images of a job: of frames.json for a video, of capture.json for photos.
@@ -113,7 +124,16 @@ def read_source(workspace: Workspace) -> Source:
         exif = tuple(image.get("exif", {}) for image in capture["images"])
         none = (None,) * len(files)
         views = _views(capture["images"])
-        source = Source(root, files, none, is_video=False, exif=exif, views=views)
+        masks = tuple(image.get("mask") for image in capture["images"])
+        source = Source(
+            root,
+            files,
+            none,
+            is_video=False,
+            exif=exif,
+            views=views,
+            masks=masks if any(masks) else (),
+        )
     missing = [file for file in source.files if not (root / file).is_file()]
     if not source.files or missing:
         raise CaptureError(

@@ -66,6 +66,11 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             Path(scratch),
             num_threads=options.num_threads if ctx.memory == "full" else 1,
             seed=ctx.seed,
+            masks={
+                index: root / image.mask
+                for index, image in enumerate(cameras.images)
+                if image.mask is not None
+            },
         )
 
         def measured(found: Refined) -> Beside | None:

@@ -85,6 +85,7 @@ def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             Path(scratch),
             num_threads=_num_threads(options, ctx),
             seed=ctx.seed,
+            masks=source.mask_paths,
         )
         ladder = Ladder(reconstructor, checkpoint, source, options, ctx)
         try:
@@ -205,9 +206,10 @@ def write_cameras(
             camera=camera,
             world_from_camera=tuple(tuple(float(value) for value in row) for row in pose),
             timestamp_s=time_s,
+            mask=mask,
         )
-        for file, camera, time_s, pose in zip(
-            found.files, found.camera_of, found.timestamps_s, poses, strict=True
+        for file, camera, time_s, mask, pose in zip(
+            found.files, found.camera_of, found.timestamps_s, found.masks, poses, strict=True
         )
     )
     CamerasFile(

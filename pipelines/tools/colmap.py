@@ -21,7 +21,7 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,8 @@ class Reconstructor:
     """Features, matches and models of one list of images.
 
     database: COLMAP's database, made where it is missing. images: in the order that indices mean.
-    scratch: a folder for links and models, no longer needed afterwards.
+    scratch: a folder for links and models, no longer needed afterwards. masks: by the indices of
+    their images, pictures of the same size: no features are found where they are black.
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class Reconstructor:
         *,
         num_threads: int = -1,
         seed: int = 0,
+        masks: Mapping[int, Path] | None = None,
     ) -> None:
         pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR.value)
         self.database = database
@@ -94,9 +96,16 @@ class Reconstructor:
         self.links = scratch / "images"
         self.links.mkdir(parents=True, exist_ok=True)
         for name, path in zip(self.names, images, strict=True):
-            link = self.links / name
-            if not os.path.lexists(link):
-                _name_again(path.resolve(), link)
+            _name_again(path.resolve(), self.links / name)
+        self.masks = scratch / "masks" if masks else None
+        if masks and self.masks is not None:
+            self.masks.mkdir(exist_ok=True)
+            for index, name in enumerate(self.names):
+                link = self.masks / f"{name}.png"
+                if index in masks:
+                    _name_again(masks[index].resolve(), link)
+                else:  # COLMAP reads no image without
+                    _hide_nothing(self.links / name, link)
 
     def on(self, database: Path) -> Reconstructor:
         """The same images with another database."""
@@ -117,7 +126,7 @@ class Reconstructor:
         probe = self.scratch / "probe.db"
         probe.unlink(missing_ok=True)
         names = [self.names[index] for index in indices]
-        reader, options = pycolmap.ImageReaderOptions(), extraction_options(settings)
+        reader, options = self._reader(), extraction_options(settings)
         self.on(probe)._extract_portion(names, reader, options, PER_IMAGE, lambda _done: None, 0)
         counts = read_statistics(probe, len(self.names)).num_features
         return [int(counts[index]) for index in indices]
@@ -130,7 +139,7 @@ class Reconstructor:
         step = max(_IMAGE_PORTION, 4 * settings.num_threads)
         done = 0
         for group in groups:
-            reader = pycolmap.ImageReaderOptions()
+            reader = self._reader()
             reader.camera_model = group.lens
             reader.camera_params = self._prior_params(group)
             for first in range(0, len(group.indices), step):
@@ -141,6 +150,13 @@ class Reconstructor:
                 if first == 0 and done < len(self.names):
                     reader.existing_camera_id = self._camera_of(names[0])
         watch(done)
+
+    def _reader(self) -> Any:
+        """How COLMAP reads images."""
+        reader = pycolmap.ImageReaderOptions()
+        if self.masks is not None:
+            reader.mask_path = self.masks
+        return reader
 
     def _extract_portion(
         self, names: list[str], reader: Any, options: Any, cameras: Any, watch: Watch, done: int
@@ -393,9 +409,17 @@ class Reconstructor:
             ) from error
 
 
+def _hide_nothing(image: Path, mask: Path) -> None:
+    """Write a mask of an image's size that is white all over."""
+    with Image.open(image) as opened:
+        Image.new("L", opened.size, 255).save(mask)
+
+
 def _name_again(path: Path, link: Path) -> None:
     """A second name of a file. A contained stage makes no symbolic links, and links of the other
     kind lead to no other disk."""
+    if os.path.lexists(link):
+        return
     try:
         os.link(path, link)
     except OSError:

@@ -216,8 +216,8 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=9,
-    reads=("depth", "mesh"),
+    version=10,
+    reads=("ingest", "depth", "mesh"),
     run=run,
     options=PointcloudOptions,
     artifacts=(

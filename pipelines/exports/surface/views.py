@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from pipelines.scene.bounds import SceneBounds
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.depth_views import DepthView, Pinhole, ViewStore
 from pipelines.scene.known_depths import KnownDepths
+from pipelines.scene.stereo_views import unhidden
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
 from pipelines.workspace import Workspace
@@ -49,7 +51,8 @@ def render_views(
     known: KnownDepths | None = None,
     words: str = "view",
 ) -> ViewStore:
-    """Depth views from the images' poses, each through its lens, in a store on disk.
+    """Depth views from the images' poses, each through its lens, in a store on disk. Nothing is
+    known where an image's mask hides what was there: the field learnt nothing there from it.
 
     folder: for the store. shares: of the export's progress, before and after. known: the capture's
     own maps; what they say of an image is a view of its own beside the field's, with a vote of its
@@ -57,9 +60,13 @@ def render_views(
     """
     store = ViewStore(folder)
     begin, end = shares
+    root = ctx.workspace.images_root
     started = time.monotonic()
     for done, (image, lens) in enumerate(zip(images, lenses, strict=True), start=1):
         view = scene.depth_view(lens, np.asarray(image.world_from_camera, np.float64))
+        shown = unhidden(root, image, scene.lens_of(image), lens)
+        if shown is not None:
+            view = replace(view, z_depth=np.where(shown, view.z_depth, np.float32(0.0)))
         store.append(view)
         told = None if known is None else known.view_of(image.file, view)
         if told is not None:

@@ -88,6 +88,34 @@ def test_cameras_match_the_truth_up_to_a_similarity(job: tuple[Path, Any, Any]) 
     assert angles.max() < 1.0
 
 
+def test_what_masks_hide_moves_no_poses(tmp_path: Path) -> None:
+    """A poster that stands still in all pictures, whatever the camera does: half of each."""
+    poster = np.random.default_rng(3).integers(0, 255, (60, 40, 3), np.uint8)
+    pictures = [render(pose) for pose in arc_poses(10)]
+    width, height = pictures[0].size
+    still = Image.fromarray(poster).resize((width // 2, height), Image.Resampling.BICUBIC)
+    mask = Image.new("L", (width, height), 255)
+    mask.paste(0, (0, 0, width // 2, height))
+    for picture in pictures:
+        picture.paste(still, (0, 0))
+    save_photos(tmp_path, pictures)
+    listing = tmp_path / "ingest" / "capture.json"
+    images = json.loads(listing.read_text("utf-8"))["images"]
+    (tmp_path / "ingest" / "masks").mkdir()
+    for number, image in enumerate(images):
+        image["mask"] = f"masks/{number:02d}.png"
+        mask.save(tmp_path / "ingest" / image["mask"])
+    listing.write_text(json.dumps({"images": images}), "utf-8")
+    run(OPTIONS, context(tmp_path))
+    cameras = CamerasFile.load(tmp_path / ".partial/poses/cameras.json")
+    assert [image.mask for image in cameras.images] == [image["mask"] for image in images]
+    poses = np.array([image.world_from_camera for image in cameras.images])
+    truth = arc_poses(10)
+    move = similarity(poses[:, :, 3], truth[:, :, 3])
+    errors = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - truth[:, :, 3], axis=1)
+    assert errors.mean() < 0.02 * np.ptp(truth[:, :, 3], axis=0).max()
+
+
 def test_the_world_is_upright_and_cameras_fill_the_unit_cube(job: tuple[Path, Any, Any]) -> None:
     cameras = CamerasFile.load(job[0] / ".partial/poses/cameras.json")
     poses = np.array([image.world_from_camera for image in cameras.images])

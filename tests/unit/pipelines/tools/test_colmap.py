@@ -57,6 +57,26 @@ def test_counting_features_leaves_the_database_alone(tmp_path: Path) -> None:
     assert min(counted) > 50
 
 
+def test_no_features_are_found_where_masks_are_black(tmp_path: Path) -> None:
+    paths = three_pictures(tmp_path)
+    with Image.open(paths[0]) as opened:
+        width, height = opened.size
+    mask = Image.new("L", (width, height), 255)
+    mask.paste(0, (0, 0, width // 2, height))
+    mask.save(tmp_path / "mask.png")
+    reconstructor = Reconstructor(
+        tmp_path / "colmap.db", paths, tmp_path / "s", masks={1: tmp_path / "mask.png"}
+    )
+    reconstructor.extract((CameraGroup((0, 1, 2), "SIMPLE_RADIAL"),), COARSE, nothing)
+    with pycolmap.Database.open(tmp_path / "colmap.db") as database:
+        images = sorted(database.read_all_images(), key=lambda image: image.name)
+        x = [database.read_keypoints(image.image_id)[:, 0] for image in images]
+    assert (x[1] >= width // 2 - 1).all()
+    assert len(x[1]) > 20
+    assert (x[0] < width // 2 - 1).any()
+    assert (x[2] < width // 2 - 1).any()
+
+
 def test_doubling_finds_more_features(tmp_path: Path) -> None:
     reconstructor = Reconstructor(tmp_path / "colmap.db", three_pictures(tmp_path), tmp_path / "s")
     coarse = reconstructor.count_features([0, 1, 2], COARSE)
