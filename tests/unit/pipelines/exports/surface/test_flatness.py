@@ -108,6 +108,21 @@ def test_a_ball_stays_a_ball() -> None:
     assert np.abs(np.linalg.norm(flat, axis=1) - 1.0).max() < 0.02
 
 
+def test_the_bumpy_side_of_a_barrel_stays_round() -> None:
+    """Of what lies near a plane there half is bumps; laid on planes it would be a prism."""
+    side = 140
+    angle, height = np.meshgrid(np.linspace(-0.6, 0.6, side), np.linspace(0.0, 1.2, side))
+    bumps = np.random.default_rng(0).normal(size=(side, side))
+    for _ in range(12):  # as wide as those that depth has on dark bronze
+        around = [np.roll(bumps, shift, axis) for axis in (0, 1) for shift in (-1, 1)]
+        bumps = np.mean([bumps, *around], axis=0)
+    radius = 1.0 + 0.005 * bumps / bumps.std()
+    points = np.stack([radius * np.sin(angle), radius * np.cos(angle), height], axis=-1)
+    points = points.reshape(-1, 3)
+    parts = find_flat_parts(points, MeshRings(faces_of(side), side * side))
+    assert (parts.plane_of != NOWHERE).mean() < 0.02
+
+
 def told(points: Floats, trust: float) -> Answers:
     """Photos that are as sure that all is where it is."""
     count = len(points)
