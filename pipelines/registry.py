@@ -89,7 +89,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="depth",
-        version=12,
+        version=13,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.depth:run",
@@ -144,7 +144,7 @@ STAGES: tuple[Stage, ...] = (
     *(_export_stage(export) for export in EXPORTS),
     Stage(
         name="assess",
-        version=9,
+        version=10,
         after=("evaluate", "pointcloud", "mesh"),
         reads=("ingest", "frames", "poses", "depth", "train", "evaluate", "pointcloud", "mesh"),
         run="pipelines.stages.assess:run",

@@ -83,10 +83,11 @@ def _store(
             code="image_undecodable",
             hint="Leave the picture out, or set ingest.projection to auto.",
         )
-    if picture.mask is not None:
-        (out / picture.mask).unlink()
+    for beside in (picture.mask, picture.cut):
+        if beside is not None:
+            (out / beside).unlink()
     (out / FOLDER).mkdir(exist_ok=True)
     panorama = f"{FOLDER}/{picture.file.rpartition('/')[2]}"
     (out / picture.file).rename(out / panorama)
     views = write_views(out / panorama, out, f"{number:05d}", options.panorama_views)
-    return replace(picture, file=panorama, views=tuple(views), mask=None)
+    return replace(picture, file=panorama, views=tuple(views), mask=None, cut=None)

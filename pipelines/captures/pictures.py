@@ -25,6 +25,7 @@ from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 
 JPEG_QUALITY = 95
+_MASK_FOLDERS = ("masks", "cuts")
 # Segments of a JPEG that hold nothing private: JFIF and Adobe's note on the colour transform.
 _HARMLESS_SEGMENTS = frozenset({"APP0", "APP14"})
 _HARMLESS_PNG_KEYS = frozenset({"dpi", "gamma", "srgb", "aspect", "interlace"})
@@ -36,7 +37,8 @@ class Picture:
 
     file: relative to the stage's folder. source: its name as sent. projection: as its XMP names it,
     "" for a plain view. views: files of those that were cut from it, where it is a panorama. mask:
-    file of a one-channel picture of its size, black where it is to be ignored, or None.
+    file of a one-channel picture of its size, black where it is to be ignored, or None. cut: the
+    same, of what it was cut out by, black where nothing stands.
     """
 
     file: str
@@ -47,6 +49,7 @@ class Picture:
     projection: str = ""
     views: tuple[str, ...] = ()
     mask: str | None = None
+    cut: str | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain JSON, for `capture.json`."""
@@ -58,6 +61,7 @@ class Picture:
             "exif": self.exif.as_dict(),
             **({"views": list(self.views)} if self.views else {}),
             **({"mask": self.mask} if self.mask else {}),
+            **({"cut": self.cut} if self.cut else {}),
         }
 
 
@@ -71,7 +75,7 @@ def evenly_picked(count: int, most: int) -> list[int]:
 
 
 class PictureWriter:
-    """Writes pictures of one archive to `out/images` and masks to `out/masks`.
+    """Writes pictures of one archive to `out/images`, masks to `out/masks` and `out/cuts`.
 
     upright: whether the EXIF orientation is applied (photos) or only dropped (posed pictures).
     """
@@ -85,14 +89,15 @@ class PictureWriter:
         self._upright = upright
         self._raw = out / ".raw"
         self._without_profile: list[str] = []
-        for folder in ("images", "masks"):
+        for folder in ("images", *_MASK_FOLDERS):
             (out / folder).mkdir(parents=True, exist_ok=True)
 
     def close(self) -> None:
         """Remove what was only needed while writing."""
         self._raw.unlink(missing_ok=True)
-        if not any((self._out / "masks").iterdir()):
-            (self._out / "masks").rmdir()
+        for folder in _MASK_FOLDERS:
+            if not any((self._out / folder).iterdir()):
+                (self._out / folder).rmdir()
 
     def store(
         self, name: str, number: int, mask: str | None = None, meaning: Meaning = "ignore"
@@ -100,7 +105,8 @@ class PictureWriter:
         """Decode the picture `name` and write it as `images/<number>`.
 
         mask: the one in the archive that lies beside it (`pipelines.captures.photo_masks`), or
-        None; by its meaning the picture is cut out, or the mask is written as `masks/<number>`.
+        None; by its meaning the picture is cut out and the mask is written as `cuts/<number>`, or
+        it is written as `masks/<number>`.
         Raises CaptureError image_undecodable.
         """
         kind = self._archive.image_format(name)
@@ -110,7 +116,8 @@ class PictureWriter:
                 return self._store(image, self._raw, kind, name, number)
             beside = self._mask_beside(mask, name, image)
             if meaning == "cut_out":
-                return self._store(image, self._raw, kind, name, number, beside)
+                picture = self._store(image, self._raw, kind, name, number, beside)
+                return replace(picture, cut=self._write_mask(beside, number, "cuts"))
             picture = self._store(image, self._raw, kind, name, number)
             return replace(picture, mask=self._write_mask(beside, number))
 
@@ -194,9 +201,9 @@ class PictureWriter:
                 )
             return self._write_mask(image, number)
 
-    def _write_mask(self, mask: PIL.Image.Image, number: int) -> str:
+    def _write_mask(self, mask: PIL.Image.Image, number: int, folder: str = "masks") -> str:
         """Write a mask without what its file said beside it; returns its path below `out`."""
-        file = f"masks/{number:05d}.png"
+        file = f"{folder}/{number:05d}.png"
         PIL.Image.frombytes("L", mask.size, mask.convert("L").tobytes()).save(self._out / file)
         return file
 

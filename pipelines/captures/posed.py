@@ -112,6 +112,7 @@ def write_posed(
             mask=item.mask,
             depth=item.depth,
             depth_lens=item.depth_lens,
+            cut=item.picture.cut,
         )
         for item, pose in zip(stored, poses, strict=True)
     )

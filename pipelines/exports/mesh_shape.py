@@ -27,6 +27,7 @@ from pipelines.exports.reduction import reduced
 from pipelines.exports.subject import Decision, Thing
 from pipelines.exports.subject_files import as_dict
 from pipelines.exports.subject_search import SEARCH_SHARE, look_at_one_place, search_subject
+from pipelines.exports.surface.carving import carved
 from pipelines.exports.surface.holes import close_holes, hole_limits
 from pipelines.exports.surface.outlines import outlined
 from pipelines.exports.surface.refinement import refined
@@ -42,9 +43,10 @@ from pipelines.exports.surface.views import known_depths, render_views
 from pipelines.exports.surface.watertight import is_closed, made_watertight, why_open
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_views import Floats, Pinhole, ViewStore
 from pipelines.scene.known_depths import KnownDepths
-from pipelines.scene.stereo_views import ColorView, color_view, stereo_view
+from pipelines.scene.stereo_views import ColorView, color_view, stereo_view, view_of
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
 
@@ -162,7 +164,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
         told = ctx.told_part("closing holes", _MEND_SHARE, _CLOSED_SHARE)
         limits = hole_limits(shells, options.close_holes, options.max_distance)
         closing = close_holes(mesh, limits, store, told)
-    mesh = closing.mesh
+    mesh = _out_of_the_void(closing.mesh, scene, ctx)
     if options.refine == "photos":
         mesh = _on_the_edges(mesh, scene, ctx)
     return Surface(mesh, shells, method, coarser, closing.as_dict())
@@ -212,6 +214,25 @@ def _on_the_edges(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) ->
     """The mesh with its outlines on the edges of the training photos."""
     told = ctx.told_part("moving outlines", _CLOSED_SHARE, _REFINE_SHARE)
     return outlined(mesh, _photos(color_view, scene, ctx, told), told)
+
+
+def _out_of_the_void(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
+    """The mesh without what stands before the sky or the blank ground that `depth` told of."""
+    if not ctx.workspace.is_complete("depth"):
+        return mesh
+    told = ctx.workspace.manifest("depth")["summary"]
+    # What is dark may be something that nobody saw.
+    if told.get("dark", {}).get("share") or not any(
+        told.get(kind, {}).get("share") for kind in ("blank", "sky")
+    ):
+        return mesh
+    images = {image.file: image for image in scene.training_images()}
+    views = (
+        (view_of(images[item.file], item.lens, found.z), found.is_void)
+        for item, found in DepthMapsFile(ctx.workspace.stage("depth"))
+        if item.file in images
+    )
+    return carved(mesh, views, ctx.check_cancelled)
 
 
 def _photos(

@@ -57,6 +57,8 @@ class PosedImage:
         covers what that lens shows in a picture of the image's size. Or None.
     light: how brightly it was taken, where pictures were levelled: gains of red, green and blue
         over the capture's mean light, and the camera's bend (`pipelines.nerf.data.light`). Or None.
+    cut: path of a one-channel image by which a thing was cut out of its photo, black where nothing
+        stands, or None.
     """
 
     file: str
@@ -68,6 +70,7 @@ class PosedImage:
     depth: str | None = None
     depth_lens: Intrinsics | None = None
     light: tuple[float, float, float, float] | None = None
+    cut: str | None = None
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ from pipelines.scene.picture_sampling import at_grid, sampling_grid
 from pipelines.scene.sensor_depth import load_sensor_depth
 
 _OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
+_STANDS = 128
+"""Of 255, from which a mask says that something stands there."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,21 @@ def unhidden(
     there = np.ones((pinhole.height, pinhole.width), np.float32)
     shown: NDArray[np.bool_] = _undistorted(_unmasked(there, root, image), lens, pinhole) > 0.0
     return shown
+
+
+def cut_away(
+    root: Path, image: PosedImage, lens: Intrinsics, pinhole: Pinhole
+) -> NDArray[np.bool_] | None:
+    """Where nothing stands in an image by what it was cut out by, as that pinhole sees it, [H, W];
+    nowhere beyond the image. None for one that was not cut out. root: as there.
+    """
+    if image.cut is None:
+        return None
+    size = (pinhole.width, pinhole.height)
+    with Image.open(root / image.cut) as opened:
+        stands = np.asarray(opened.convert("L").resize(size, Image.Resampling.BOX)) >= _STANDS
+    shown = _undistorted(stands.astype(np.float32), lens, pinhole)
+    return (shown >= 0.0) & (shown < 0.5)
 
 
 def sensor_depth(

@@ -25,7 +25,8 @@ class FoundImages:
     files, timestamps_s: as in `Source`. cameras: their lenses. camera_of: [N], index into
     `cameras`. world_from_camera: [N, 3, 4] float64. up: N, the direction away from gravity in
     OpenGL camera axes (+X right, +Y up, looks along -Z) where the device measured it, else None.
-    masks: N files, black where an image is to be ignored, or None.
+    masks: N files, black where an image is to be ignored, or None. cuts: the same of what images
+    were cut out by, black where nothing stands.
     """
 
     files: tuple[str, ...]
@@ -35,6 +36,7 @@ class FoundImages:
     world_from_camera: npt.NDArray[np.float64]
     up: tuple[Sequence[float] | None, ...]
     masks: tuple[str | None, ...]
+    cuts: tuple[str | None, ...]
 
 
 def found_images(model: SparseModel, source: Source) -> FoundImages:
@@ -46,6 +48,7 @@ def found_images(model: SparseModel, source: Source) -> FoundImages:
     poses: list[npt.NDArray[np.float64]] = []
     up: list[Sequence[float] | None] = []
     masks: list[str | None] = []
+    cuts: list[str | None] = []
     for index, camera, pose in zip(
         model.indices, model.camera_of, model.world_from_camera, strict=True
     ):
@@ -57,6 +60,7 @@ def found_images(model: SparseModel, source: Source) -> FoundImages:
         camera_of += [camera] * num
         up += [None if views else source.up_of(index)] * num
         masks += [None if views else source.mask_of(index)] * num
+        cuts += [None if views else source.cut_of(index)] * num
     return FoundImages(
         tuple(files),
         tuple(times),
@@ -65,4 +69,5 @@ def found_images(model: SparseModel, source: Source) -> FoundImages:
         np.stack(poses),
         tuple(up),
         tuple(masks),
+        tuple(cuts),
     )

@@ -42,7 +42,8 @@ class Source:
     neighbours in time. views: for each image the views that were cut from it, none of one that is
     no panorama; of a capture without panoramas nothing at all. clip_names: what the sender called
     each clip, by its number. masks: as `files`, black where an image is to be ignored, None for
-    those without; nothing at all of a capture without masks.
+    those without; nothing at all of a capture without masks. cuts: the same of what images were cut
+    out by, black where nothing stands.
     """
 
     root: Path
@@ -54,6 +55,7 @@ class Source:
     views: tuple[tuple[str, ...], ...] = ()
     clip_names: tuple[str, ...] = ()
     masks: tuple[str | None, ...] = ()
+    cuts: tuple[str | None, ...] = ()
 
     @property
     def has_panoramas(self) -> bool:
@@ -88,6 +90,10 @@ class Source:
     def mask_of(self, index: int) -> str | None:
         """The file of an image's mask, or None."""
         return self.masks[index] if self.masks else None
+
+    def cut_of(self, index: int) -> str | None:
+        """The file of what an image was cut out by, or None."""
+        return self.cuts[index] if self.cuts else None
 
     @property
     def mask_paths(self) -> dict[int, Path]:
@@ -124,7 +130,9 @@ def read_source(workspace: Workspace) -> Source:
         exif = tuple(image.get("exif", {}) for image in capture["images"])
         none = (None,) * len(files)
         views = _views(capture["images"])
-        masks = tuple(image.get("mask") for image in capture["images"])
+        masks, cuts = (
+            tuple(image.get(what) for image in capture["images"]) for what in ("mask", "cut")
+        )
         source = Source(
             root,
             files,
@@ -133,6 +141,7 @@ def read_source(workspace: Workspace) -> Source:
             exif=exif,
             views=views,
             masks=masks if any(masks) else (),
+            cuts=cuts if any(cuts) else (),
         )
     missing = [file for file in source.files if not (root / file).is_file()]
     if not source.files or missing:

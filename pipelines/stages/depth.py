@@ -46,11 +46,16 @@ from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsWriter
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.natural_order import natural_key
-from pipelines.scene.stereo_views import sensor_depth, stereo_view, undistorted_picture
+from pipelines.scene.stereo_views import (
+    cut_away,
+    sensor_depth,
+    stereo_view,
+    undistorted_picture,
+)
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 from pipelines.stages.depth_checkpoint import DepthCheckpoint, inputs_of
-from pipelines.stages.void_masks import known_points, up_and_points
+from pipelines.stages.void_masks import BY_CUTS, known_points, up_and_points
 
 _LOAD_SHARE, _STEREO_SHARE, _VOID_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.7, 0.02, 0.1, 0.1
 _LIGHT_SHARE = 0.03
@@ -227,6 +232,16 @@ class _Search:
             found.append(sensor_depth(root, image, lens, _pinhole(view)))
         return found
 
+    def _cut_away(self) -> list[NDArray[np.bool_]] | None:
+        """Where nothing stands in each view, of pictures that were cut out by masks; else None."""
+        root = self.ctx.workspace.images_root
+        found = [
+            cut_away(root, image, self.capture.cameras[image.camera], _pinhole(view))
+            for image, view in zip(self.images, self.views, strict=True)
+        ]
+        cut = [mask for mask in found if mask is not None]
+        return cut if len(cut) == len(found) else None
+
     def _without_void(self) -> Found:
         maps, views = self.checkpoint.maps(), self.views
         on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE, _VOID_SHARE)
@@ -237,7 +252,12 @@ class _Search:
         sensed = None if self.source == "stereo" else self._sensed()
         told: dict[str, Any] = {}
         masks = [np.zeros(view.picture.shape, np.bool_) for view in views]
-        if self.config.find_blank:
+        cut = self._cut_away()
+        if cut is not None:
+            share = float(np.mean([mask.mean() for mask in cut]))
+            told["blank"] = {**_rounded(share, len(cut)), "by": BY_CUTS}
+            masks = cut
+        elif self.config.find_blank:
             seen = views, self.color_picture, maps.z, sensed
             blank = find_blank(*seen, quarter(0, "looking for a blank ground"))
             told["blank"] = _rounded(blank.share, blank.num_views)

@@ -207,9 +207,16 @@ def write_cameras(
             world_from_camera=tuple(tuple(float(value) for value in row) for row in pose),
             timestamp_s=time_s,
             mask=mask,
+            cut=cut,
         )
-        for file, camera, time_s, mask, pose in zip(
-            found.files, found.camera_of, found.timestamps_s, found.masks, poses, strict=True
+        for file, camera, time_s, mask, cut, pose in zip(
+            found.files,
+            found.camera_of,
+            found.timestamps_s,
+            found.masks,
+            found.cuts,
+            poses,
+            strict=True,
         )
     )
     CamerasFile(

@@ -20,12 +20,14 @@ from pipelines.scene.cameras_file import CamerasFile, PosedImage
 from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.orientation import find_up
-from pipelines.scene.stereo_views import stereo_view, undistorted_picture, view_of
+from pipelines.scene.stereo_views import cut_away, stereo_view, undistorted_picture, view_of
 from pipelines.workspace import Workspace
 
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+BY_CUTS = "masks"
+"""What `depth` says that a blank ground was told by where masks cut the pictures out."""
 Look = Callable[[StereoView, Bytes], Bools]
 """What of a view's picture, [H, W, 3] sRGB, is nothing: [H, W]."""
 
@@ -57,9 +59,10 @@ def void_masks(
         return None
     made = workspace.manifest("depth")
     looks = _looks(workspace, capture, made["summary"])
-    if not looks:
+    blank = made["summary"].get("blank", {})
+    by_cuts, is_cut_out = blank.get("by") == BY_CUTS, bool(blank.get("share"))
+    if not looks and not by_cuts:
         return None
-    is_cut_out = bool(made["summary"].get("blank", {}).get("share"))
     side, root = made["options"]["long_side_px"], workspace.images_root
     found, lenses = [], []
     for image in images:
@@ -67,10 +70,12 @@ def void_masks(
         view = stereo_view(root, image, lens, side)
         height, width = view.picture.shape
         pinhole = Pinhole(width, height, *view.lens)
-        # As `depth` saw it: before the pictures were brought to one light.
-        picture = undistorted_picture(root, replace(image, light=None), lens, pinhole)
-        mask = np.any([look(view, picture) for look in looks], axis=0)
-        found.append(mask.astype(np.float32))
+        cut = cut_away(root, image, lens, pinhole) if by_cuts else None
+        if cut is None:
+            # As `depth` saw it: before the pictures were brought to one light.
+            picture = undistorted_picture(root, replace(image, light=None), lens, pinhole)
+            cut = np.any([look(view, picture) for look in looks], axis=0)
+        found.append(cut.astype(np.float32))
         lenses.append(view.lens)
     maps = DepthMaps.from_arrays(found, lenses, 1.0)
     whole = None
@@ -91,7 +96,7 @@ def _looks(workspace: Workspace, capture: CamerasFile, told: dict[str, Any]) -> 
     """How to tell each of the kinds of nothing that `depth` told of."""
     looks: list[Look] = []
     blank = told.get("blank", {})
-    if blank.get("share"):
+    if blank.get("share") and blank.get("by") != BY_CUTS:
         on_thing, (red, green, blue) = _solid_points(workspace, capture), blank["color"]
         color = (red, green, blue)
         looks.append(

@@ -105,14 +105,17 @@ class Photos:
         return photo if light is None else photo.point(light_table(light).T.reshape(-1).tolist())
 
     def usable(self, index: int, pixels: Floats) -> Bools:
-        """Whether the photo's mask lets pixels [P, 2] count; all of them without a mask."""
-        mask = self._images[index].mask
-        if mask is None:
-            return np.ones(len(pixels), np.bool_)
-        with Image.open(self._root / mask) as opened:
-            shown = np.asarray(opened.convert("L")) >= _USABLE
-        columns, rows = np.clip(pixels, 0, np.array(shown.shape[::-1]) - 1).astype(int).T
-        kept: Bools = shown[rows, columns]
+        """Whether the photo's mask, and what it was cut out by, let pixels [P, 2] count; all of
+        them without any."""
+        image = self._images[index]
+        kept: Bools = np.ones(len(pixels), np.bool_)
+        for mask in (image.mask, image.cut):
+            if mask is None:
+                continue
+            with Image.open(self._root / mask) as opened:
+                shown = np.asarray(opened.convert("L")) >= _USABLE
+            columns, rows = np.clip(pixels, 0, np.array(shown.shape[::-1]) - 1).astype(int).T
+            kept &= shown[rows, columns]
         return kept
 
 

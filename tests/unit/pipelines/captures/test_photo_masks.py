@@ -82,6 +82,9 @@ def test_a_thing_that_masks_cut_out_is_left_on_white(tmp_path: Path, where: str,
         assert np.abs(picture - scene(n))[inside & ~edge].mean() < 6
     assert not (ctx.out / "masks").exists()
     assert all("mask" not in entry for entry in entries(ctx))
+    for n, entry in enumerate(entries(ctx)):
+        cut = np.asarray(PIL.Image.open(ctx.out / entry["cut"]))
+        assert ((cut > 127) == (np.roll(disc(), n, 1) > 0)).mean() > 0.99
 
 
 def test_what_masks_hide_is_to_be_ignored(tmp_path: Path) -> None:
@@ -204,4 +207,6 @@ def test_pictures_with_poses_have_masks_beside_them_too(
         assert found == [f"masks/{n:05d}.png" for n in range(1, 10)]
     else:
         assert found == [None] * 9
+        cuts = [image.cut for image in cameras(ctx).images]
+        assert cuts == [f"cuts/{n:05d}.png" for n in range(1, 10)]
         assert (written(ctx, 1)[:8] > 230).all()

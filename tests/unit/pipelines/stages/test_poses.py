@@ -104,11 +104,13 @@ def test_what_masks_hide_moves_no_poses(tmp_path: Path) -> None:
     (tmp_path / "ingest" / "masks").mkdir()
     for number, image in enumerate(images):
         image["mask"] = f"masks/{number:02d}.png"
+        image["cut"] = f"cuts/{number:02d}.png"
         mask.save(tmp_path / "ingest" / image["mask"])
     listing.write_text(json.dumps({"images": images}), "utf-8")
     run(OPTIONS, context(tmp_path))
     cameras = CamerasFile.load(tmp_path / ".partial/poses/cameras.json")
     assert [image.mask for image in cameras.images] == [image["mask"] for image in images]
+    assert [image.cut for image in cameras.images] == [image["cut"] for image in images]
     poses = np.array([image.world_from_camera for image in cameras.images])
     truth = arc_poses(10)
     move = similarity(poses[:, :, 3], truth[:, :, 3])

@@ -1,5 +1,5 @@
 """Where nothing stands: no depth, no hole, and training lets light through; in the sky, in the
-dark, and on the blank ground of cut-out pictures alike."""
+dark, and on the blank ground of cut-out pictures alike, be it told by its colour or by masks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,13 @@ from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
 STEREO = {"long_side_px": 128, "num_planes": 64, "num_neighbours": 4}
-TAKES = {"sky": monument.TAKE, "dark": exhibit.TAKE, "blank": exhibit.TAKE}
+TAKES = {
+    "sky": monument.TAKE,
+    "dark": exhibit.TAKE,
+    "blank": exhibit.TAKE,
+    "masks": exhibit.TAKE,
+}
+CUT_OUT = ("blank", "masks")
 NOBODY_LOOKS = {"find_sky": False, "find_dark": False, "find_blank": False}
 
 
@@ -36,6 +42,11 @@ class Filmed:
     take: Take
     workspace: Workspace
 
+    @property
+    def told_as(self) -> str:
+        """What the stage calls it."""
+        return "blank" if self.kind in CUT_OUT else self.kind
+
     def exact(self, lens: Pinhole, pose: np.ndarray) -> np.ndarray:
         """True depth, [H, W], 0 where nothing stands."""
         depth: np.ndarray = depth_image(lens.intrinsics(), pose, self.take.scene)
@@ -43,16 +54,28 @@ class Filmed:
 
 
 def filmed(root: Path, kind: str) -> Workspace:
-    """The capture; pictures of a cut-out thing are transparent around it, and laid on white."""
+    """The capture; pictures of a cut-out thing are transparent around it, and laid on white, or
+    have masks: then the ground may have any colour, and here it has no single one."""
     workspace = tiny_job.make_capture(root, 24, TAKES[kind], 128)
-    if kind == "blank":
-        folder = workspace.stage("ingest")
-        capture = CamerasFile.load(folder / "cameras.json")
-        for image in capture.images:
-            depth = depth_image(capture.cameras[0], pose_matrix(image), TAKES[kind].scene)
-            with Image.open(folder / image.file) as opened:
-                picture = np.where((depth == 0)[..., None], 255, np.asarray(opened))
-            Image.fromarray(picture.astype(np.uint8)).save(folder / image.file)
+    if kind not in CUT_OUT:
+        return workspace
+    folder = workspace.stage("ingest")
+    capture = CamerasFile.load(folder / "cameras.json")
+    (folder / "cuts").mkdir()
+    images = []
+    for number, image in enumerate(capture.images):
+        depth = depth_image(capture.cameras[0], pose_matrix(image), TAKES[kind].scene)
+        ground = np.full(depth.shape, 255.0)
+        if kind == "masks":
+            ground[:] = np.linspace(180.0, 255.0, depth.shape[1])
+            cut = f"cuts/{number:05d}.png"
+            Image.fromarray(((depth > 0) * 255).astype(np.uint8)).save(folder / cut)
+            image = dataclasses.replace(image, cut=cut)
+        with Image.open(folder / image.file) as opened:
+            picture = np.where((depth == 0)[..., None], ground[..., None], np.asarray(opened))
+        Image.fromarray(picture.astype(np.uint8)).save(folder / image.file)
+        images.append(image)
+    dataclasses.replace(capture, images=tuple(images)).save(folder / "cameras.json")
     return workspace
 
 
@@ -87,12 +110,13 @@ def void_and_known(film: Filmed) -> tuple[float, float, float]:
 
 def test_what_is_nothing_has_no_depth(mapped: Filmed) -> None:
     summary = mapped.workspace.manifest("depth")["summary"]
-    for kind in TAKES:
-        assert (summary.get(kind, {}).get("share", 0.0) > 0.2) == (kind == mapped.kind)
+    for kind in ("sky", "dark", "blank"):
+        assert (summary.get(kind, {}).get("share", 0.0) > 0.2) == (kind == mapped.told_as)
+    assert (summary.get("blank", {}).get("by") == "masks") == (mapped.kind == "masks")
     # By day nobody looks for the dark, and what was cut out has neither sky nor dark.
     assert ("dark" in summary) == (mapped.kind == "dark")
-    assert ("sky" in summary) == (mapped.kind != "blank")
-    assert summary[mapped.kind]["num_views"] >= 20
+    assert ("sky" in summary) == (mapped.kind not in CUT_OUT)
+    assert summary[mapped.told_as]["num_views"] >= 20
     told, known, wrong = void_and_known(mapped)
     assert told > 0.8
     assert known < 0.05
@@ -102,7 +126,7 @@ def test_what_is_nothing_has_no_depth(mapped: Filmed) -> None:
 def test_unasked_it_is_filled_by_what_is_beside_it(mapped: Filmed, tmp_path: Path) -> None:
     left = filmed(tmp_path / "job", mapped.kind)
     summary = tiny_job.run(left, "depth", **STEREO, **NOBODY_LOOKS)["summary"]
-    assert not set(TAKES) & set(summary)
+    assert not {"sky", "dark", "blank"} & set(summary)
     told, known, _ = void_and_known(dataclasses.replace(mapped, workspace=left))
     assert told == 0.0
     assert known > void_and_known(mapped)[1] + 0.05
