@@ -128,11 +128,16 @@ def choose_photos(
     return [look.name for look in looks] + unreadable
 
 
+def header_of(archive: CaptureArchive, name: str) -> io.BytesIO:
+    """As much of a picture as it takes to open it, not to decode it."""
+    headed = archive.image_format(name) in _HEADED
+    return io.BytesIO(archive.peek(name, _HEADER_BYTES if headed else _MOST_BYTES))
+
+
 def _look(archive: CaptureArchive, name: str) -> _Look | None:
     kind = archive.image_format(name)
     try:
-        data = io.BytesIO(archive.peek(name, _HEADER_BYTES if kind in _HEADED else _MOST_BYTES))
-        with open_picture(data, kind) as image:
+        with open_picture(header_of(archive, name), kind) as image:
             found = RAW if image.format == RAW else kind
             sides = image.size
             if (read_exif(image).orientation or 1) >= _FIRST_ON_ITS_SIDE:

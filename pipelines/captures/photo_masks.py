@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.decoders import DAMAGED, open_picture
 from pipelines.captures.exif import read_exif
+from pipelines.captures.photo_choice import header_of
 from pipelines.captures.roles import named_role, plain_stem
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -49,20 +50,21 @@ sky, leaves more of it."""
 _CUT_OUT_SHARES = (0.01, 0.8)
 """How much of the median cut-out the thing takes."""
 _ASPECT_SLACK = 0.02
+_FIRST_ON_ITS_SIDE = 5
+"""EXIF orientations from here on exchange width and height."""
 
 
 @dataclass(frozen=True)
 class PhotoMasks:
-    """of: each photo's mask, both by their names in the archive. lacking: photos that have none."""
+    """of: each photo's mask, both by their names in the archive; none of a capture without."""
 
     of: Mapping[str, str]
     meaning: Meaning
-    lacking: frozenset[str]
 
     def check(self, photo: str) -> None:
         """Raise CaptureError image_undecodable for a photo that is not cut out as the others are:
         what is around the thing would stand in it alone."""
-        if self.meaning == "cut_out" and photo in self.lacking:
+        if self.meaning == "cut_out" and photo not in self.of:
             raise CaptureError(
                 f'"{shown(photo)}" has no mask, and the others are cut out by theirs.',
                 code="image_undecodable",
@@ -71,7 +73,10 @@ class PhotoMasks:
 
     def details(self) -> dict[str, object]:
         """For the record."""
-        return {"num_masks": len(self.of), "masks": self.meaning}
+        return {"num_masks": len(self.of), "masks": self.meaning} if self.of else {}
+
+
+NO_MASKS = PhotoMasks({}, "ignore")
 
 
 @dataclass(frozen=True)
@@ -101,28 +106,29 @@ def find_masks(
     wanted: Literal["auto", "cut_out", "ignore", "off"],
     max_pixels: int,
     ctx: StageContext,
-) -> PhotoMasks | None:
-    """The masks of photos, by their names; None where there are none that say anything.
+    *,
+    upright: bool,
+) -> PhotoMasks:
+    """The masks of photos, by their names; none where there are none that say anything.
 
     wanted: what is meant by them, "auto" for what they look like. max_pixels: masks with more are
-    not decoded.
+    not decoded. upright: whether the photos will be turned, as in `pictures.PictureWriter`.
     """
     if wanted == "off":
-        return None
+        return NO_MASKS
     looks: dict[str, _Look] = {}
     named = _named(archive, photos)
     for done, (photo, mask) in enumerate(named.items(), start=1):
         look = _look(archive, mask, max_pixels)
-        if look is not None and _fits(archive, photo, look):
+        if look is not None and _fits(archive, photo, look, upright=upright):
             looks[photo] = look
         ctx.progress(0.0, f"Looking at mask {done} of {len(named)}")
     if not looks or all(look.white.all() for look in looks.values()):
-        return None
-    lacking = frozenset(photos) - looks.keys()
+        return NO_MASKS
     meaning: Meaning = "ignore" if wanted == "auto" else wanted
     if wanted == "auto" and _cuts_out(list(looks.values()), len(photos)):
         meaning = "cut_out"
-    return PhotoMasks({photo: named[photo] for photo in looks}, meaning, lacking)
+    return PhotoMasks({photo: named[photo] for photo in looks}, meaning)
 
 
 def _named(archive: CaptureArchive, photos: Sequence[str]) -> dict[str, str]:
@@ -160,17 +166,22 @@ def _look(archive: CaptureArchive, name: str, max_pixels: int) -> _Look | None:
     return _Look(size, values >= 128)
 
 
-def _fits(archive: CaptureArchive, photo: str, look: _Look) -> bool:
-    """Whether mask and photo have one shape, as the photo is stored or turned upright."""
+def _fits(archive: CaptureArchive, photo: str, look: _Look, *, upright: bool) -> bool:
+    """Whether `fitted` will have the mask in its photo's shape."""
     try:
-        data = io.BytesIO(archive.peek(photo, _MOST_BYTES))
-        with open_picture(data, archive.image_format(photo)) as image:
-            return alike(look.size, image.size) or (
-                read_exif(image).orientation not in (None, 1)
-                and alike(look.size, (image.height, image.width))
+        with open_picture(header_of(archive, photo), archive.image_format(photo)) as image:
+            orientation = read_exif(image).orientation if upright else None
+            turned = _turned(image.size, orientation)
+            return alike(look.size, turned) or (
+                orientation not in (None, 1) and alike(look.size, image.size)
             )
     except DAMAGED:
         return False
+
+
+def _turned(size: tuple[int, int], orientation: int | None) -> tuple[int, int]:
+    """A photo's size once it is turned as EXIF says."""
+    return (size[1], size[0]) if (orientation or 1) >= _FIRST_ON_ITS_SIDE else size
 
 
 def alike(one: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -199,11 +210,11 @@ def fitted(
     it is taken for turned.
     """
     grey = mask.convert("L")
-    turned = upright and orientation not in (None, 1)
-    target = (size[1], size[0]) if turned and (orientation or 1) >= 5 else size
+    orientation = orientation if upright else None
+    target = _turned(size, orientation)
     if alike(grey.size, target):
         return _resized(grey, target)
-    if turned and alike(grey.size, size):
+    if orientation not in (None, 1) and alike(grey.size, size):
         stored = _resized(grey, size)
         stored.getexif()[0x0112] = orientation
         return PIL.ImageOps.exif_transpose(stored)

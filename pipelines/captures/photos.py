@@ -36,7 +36,7 @@ def write_photos(
     Raises CaptureError: no_images where none is, and as `storing.store_each` does.
     """
     names = choose_photos(archive, capture.names, options.max_pixels, ctx)
-    masks = find_masks(archive, names, options.masks, options.max_pixels, ctx)
+    masks = find_masks(archive, names, options.masks, options.max_pixels, ctx, upright=True)
     pictures, warnings = store_each(
         archive,
         [_Photo(name) for name in sorted(names, key=natural_key)],
@@ -52,7 +52,7 @@ def write_photos(
         details={
             "num_sizes": len(sizes),
             "largest": list(max(sizes)),
-            **({} if masks is None else masks.details()),
+            **masks.details(),
         },
         warnings=warnings,
     )
@@ -61,16 +61,13 @@ def write_photos(
 def _store(
     out: Path,
     options: IngestOptions,
-    masks: PhotoMasks | None,
+    masks: PhotoMasks,
     writer: PictureWriter,
     photo: _Photo,
     number: int,
 ) -> Picture:
-    if masks is None:
-        picture = writer.store(photo.name, number)
-    else:
-        masks.check(photo.name)
-        picture = writer.store(photo.name, number, masks.of.get(photo.name), masks.meaning)
+    masks.check(photo.name)
+    picture = writer.store(photo.name, number, masks.of.get(photo.name), masks.meaning)
     told = options.projection == EQUIRECTANGULAR
     if options.projection == "flat" or not (told or picture.projection == EQUIRECTANGULAR):
         return picture

@@ -18,7 +18,7 @@ from pipelines.captures.depth_files import DepthWriter
 from pipelines.captures.films import FilmFrames
 from pipelines.captures.minimum import MIN_POSED_IMAGES
 from pipelines.captures.parsing import malformed
-from pipelines.captures.photo_masks import PhotoMasks, find_masks
+from pipelines.captures.photo_masks import NO_MASKS, PhotoMasks, find_masks
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
 from pipelines.captures.pose_order import proven
 from pipelines.captures.record import Found, FoundPoints
@@ -130,7 +130,7 @@ def write_posed(
             "num_lenses": len(cameras),
             "num_depths": sum(image.depth is not None for image in images),
             "metric": capture.metric,
-            **({} if beside is None else beside.details()),
+            **beside.details(),
             **capture.details,
         },
         warnings=[
@@ -149,19 +149,19 @@ def _masks_beside(
     sources: Sequence[PosedSource],
     options: IngestOptions,
     ctx: StageContext,
-) -> PhotoMasks | None:
+) -> PhotoMasks:
     """Masks that lie beside the pictures where the poses name none, of pictures without a sensor's
     depth: that knows what the phone saw around a thing, too."""
     if any(item.mask or item.depth or item.frame is not None for item in sources):
-        return None
+        return NO_MASKS
     names = list(dict.fromkeys(item.name for item in sources))
-    return find_masks(archive, names, options.masks, options.max_pixels, ctx)
+    return find_masks(archive, names, options.masks, options.max_pixels, ctx, upright=False)
 
 
 def _store(
     depths: DepthWriter,
     film: FilmFrames,
-    beside: PhotoMasks | None,
+    beside: PhotoMasks,
     writer: PictureWriter,
     source: PosedSource,
     number: int,
@@ -173,11 +173,8 @@ def _store(
     what = f'"{shown(source.label)}"'
     pose = checked_pose(np.array(source.world_from_camera, np.float64), what)
     if source.frame is None:
-        if beside is None:
-            picture = writer.store(source.name, number)
-        else:
-            beside.check(source.name)
-            picture = writer.store(source.name, number, beside.of.get(source.name), beside.meaning)
+        beside.check(source.name)
+        picture = writer.store(source.name, number, beside.of.get(source.name), beside.meaning)
     else:
         picture = writer.store_frame(film.file(source), source.label, number)
     size = (picture.width, picture.height)

@@ -190,6 +190,23 @@ def test_a_mask_of_another_shape_fits_nothing() -> None:
     assert found.size == (40, 30)
 
 
+def test_masks_that_posed_pictures_are_not_turned_to_cost_no_picture(tmp_path: Path) -> None:
+    """Their intrinsics speak of pixels as stored; the masks were made of what people see."""
+    files = dict(llff_files(9))
+    for n in range(9):
+        name = f"images/{n:03d}.jpg"
+        shot = PIL.Image.fromarray(scene(n, (48, 64)))
+        shot.save(tmp_path / "shot.jpg", exif=phone_exif(5.7, 26, 6))
+        files[name] = (tmp_path / "shot.jpg").read_bytes()
+        mask = np.zeros((64, 48), np.uint8)
+        mask[20:40, 10:30] = 255
+        files[f"masks/{n:03d}.png"] = encoded(mask)
+    summary, ctx = ingest(tmp_path / "job", files)
+    assert len(sources(ctx)) == 9
+    assert "masks" not in summary
+    assert warning_with(summary, "9 pictures in masks/ were not used")
+
+
 @pytest.mark.parametrize(("mask", "meaning"), [("thing", "cut_out"), ("passer-by", "ignore")])
 def test_pictures_with_poses_have_masks_beside_them_too(
     tmp_path: Path, mask: str, meaning: str
