@@ -252,7 +252,7 @@ class _Search:
         sensed = None if self.source == "stereo" else self._sensed()
         told: dict[str, Any] = {}
         masks = [np.zeros(view.picture.shape, np.bool_) for view in views]
-        cut = self._cut_away()
+        cut = self._cut_away() if self.config.find_blank else None
         if cut is not None:
             share = float(np.mean([mask.mean() for mask in cut]))
             told["blank"] = {**_rounded(share, len(cut)), "by": BY_CUTS}
