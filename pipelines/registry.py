@@ -45,7 +45,7 @@ _EXPLAINS = "pipelines.stages.check:write_failed_check"
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=11,
+        version=12,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",
@@ -89,7 +89,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="depth",
-        version=13,
+        version=14,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.depth:run",

@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipelines.captures.daylight import is_daylight
+from pipelines.captures.record import CaptureRecord
 from pipelines.errors import TrainingError
 from pipelines.exports.shades import depth_picture, depth_range
 from pipelines.nerf.ahead import each_ahead
@@ -268,11 +270,14 @@ class _Search:
         if self.config.find_sky and not is_cut_out:
             known = up_and_points(self.ctx.workspace, self.capture)
             given = views, self.color_picture, maps.z, *known, sensed, self.patches
-            sky = find_sky(*given, quarter(1, "looking for the sky"))
+            daylight = is_daylight(CaptureRecord.load(self.ctx.workspace.stage("ingest")))
+            sky = find_sky(*given, quarter(1, "looking for the sky"), daylight=daylight)
             told["sky"] = {
                 **_rounded(sky.share, sky.num_views),
                 "far": round(sky.far, 3),
                 "by_day": sky.by_day,
+                "daylight": daylight,
+                "blown_out": round(sky.blown_out, 3),
             }
             masks = sky.masks
         # By day what is black is an unlit side of something.

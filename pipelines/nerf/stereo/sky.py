@@ -10,6 +10,10 @@ By day that is not asked: a facade has nothing behind it. Where a tenth of all p
 air is, brighter or paler along a smooth slope, without a point, above the horizon and nowhere below
 it, this is sky, and so is what is white beside it or at the top of other pictures.
 
+An overcast sky is white, and so are ceilings. But where a camera exposes for what stands on the
+ground such a sky is burnt out, which a ceiling hardly is; and of photos the exposures tell
+(`daylight`). Either way what looks like sky is sky, wherever it borders.
+
 Depth is along the camera's axis (z), 0 where unknown.
 """
 
@@ -44,15 +48,19 @@ _MOST_SPREAD, _LEAST_BRIGHT, _LEAST_EACH, _MOST_WARM = 0.06, 0.8, 0.3, 0.03
 red than blue."""
 _HORIZON_DEG, _LOW_PERCENT = -3.0, 5
 """All but so few pixels of a patch are above the horizon, which is known to some degrees."""
-_MOST_POINTS = 1e-3
+_MOST_POINTS, _MOST_BEFORE_BLOWN = 1e-3, 5e-3
 """Points of structure from motion, a few of which are always wrong, per pixel of what is inside a
-patch."""
+patch; and inside one that is burnt out, which can show none: they are hidden, or wrong."""
 _RING_FROM_PX, _RING_TO_PX = 3, 12
 _FAR, _FAR_PERCENT, _LEAST_FAR = 3.0, 90, 0.3
 """In that share of the views a tenth of what is known around their patches is so many times as far
 as the median of all that they know. Not more of it: patches' own wrong depths lie there, too."""
 _LEAST_VIEWS, _LEAST_SHARE = 3, 0.01
 """So many views show it, and so much of all pictures is it."""
+_BLOWN_OUT, _LEAST_BLOWN = 250, 0.05
+"""Of 255, the least channel of what is burnt out; and how much of all pictures is so, and looks
+like sky, where it is an overcast one. Around a building it was .11; of windows behind a thing
+.007."""
 
 _LEAST_BLUE, _LEAST_GREEN, _MOST_UNEVEN = 0.12, 0.33, 0.05
 """Of a blue sky: by how much more blue than red it has; where its green lies between these two, 0
@@ -72,7 +80,8 @@ class Sky:
     """masks: what of each view's picture is sky, [H, W]; none where the capture shows no sky.
 
     share: of all pictures. num_views: that show some, or may. far: in what share of these it
-    borders on what is far away. by_day: whether it is known to be sky for being blue.
+    borders on what is far away. by_day: whether it is known to be sky for being blue. blown_out:
+    what share of all pictures is so, and looks like sky.
     """
 
     masks: list[Bools]
@@ -80,6 +89,7 @@ class Sky:
     num_views: int
     far: float
     by_day: bool = False
+    blown_out: float = 0.0
 
 
 def find_sky(
@@ -91,6 +101,8 @@ def find_sky(
     measured: Sequence[NDArray[np.float32] | None] | None = None,
     patches: Shelf | None = None,
     on_share: Callable[[float], None] = lambda done: None,
+    *,
+    daylight: bool = False,
 ) -> Sky:
     """The sky in a capture's pictures.
 
@@ -98,40 +110,57 @@ def find_sky(
     where the sky is. up: [3], unit. points: [P, 3], world, on what was told apart from anything
     else. measured: what a sensor saw, as `depths`, None for a view without; of the sky it sees
     nothing. patches: a shelf for the pictures' `patches_of`, or with them. on_share: told the share
-    that is done; may raise.
+    that is done; may raise. daylight: whether the pictures are known to be taken outdoors by day.
     """
 
-    def look(index: int) -> tuple[Bools, bool | None, Bools, tuple[float, float]]:
-        view, z = views[index], depths[index]
-        parts = shelved_patches(view, index, patches)
-        look = _Look.at(view, picture_of(index), up, points, parts)
-        mask, by_day, blue = look.sky(), look.sky_by_day(), look.blue()
-        if not mask.any() or not (z > 0).any():
-            return mask, None, by_day, blue
-        ring = grown(mask, _RING_TO_PX) & ~grown(mask, _RING_FROM_PX) & (z > 0)
-        farthest = np.percentile(z[ring], _FAR_PERCENT) if ring.any() else 0.0
-        return mask, bool(farthest >= _FAR * np.median(z[z > 0])), by_day, blue
+    def look(index: int) -> _Found:
+        parts = shelved_patches(views[index], index, patches)
+        picture = picture_of(index)
+        return _found(_Look.at(views[index], picture, up, points, parts), picture, depths[index])
 
-    found, is_far, found_by_day, blues = [], [], [], []
-    for index, (mask, far_behind, mask_by_day, blue) in enumerate(
-        each_ahead(look, range(len(views)))
-    ):
-        found.append(mask)
-        found_by_day.append(mask_by_day)
-        blues.append(blue)
-        is_far += [] if far_behind is None else [far_behind]
-        on_share((index + 1) / len(views))
+    found = []
+    for one in each_ahead(look, range(len(views))):
+        found.append(one)
+        on_share(len(found) / len(views))
+    is_far = [one.is_far for one in found if one.is_far is not None]
     far = float(np.mean(is_far)) if is_far else 0.0
-    above, below = np.mean(blues, axis=0)
-    by_day = above >= _LEAST_DAY_SHARE and below <= _MOST_BELOW * above
-    if by_day:
-        found = found_by_day
-    num_views = sum(bool(mask.any()) for mask in found)
-    share = float(np.mean([mask.mean() for mask in found]))
+    blown_out = float(np.mean([one.blown_out for one in found]))
+    above, below = np.mean([one.blue for one in found], axis=0)
+    by_day = bool(above >= _LEAST_DAY_SHARE and below <= _MOST_BELOW * above)
+    masks = [one.by_day if by_day else one.pale for one in found]
+    num_views = sum(bool(mask.any()) for mask in masks)
+    share = float(np.mean([mask.mean() for mask in masks]))
+    is_told = by_day or daylight or far >= _LEAST_FAR or blown_out >= _LEAST_BLOWN
     too_little = num_views < _LEAST_VIEWS or share < _LEAST_SHARE
-    if too_little or (far < _LEAST_FAR and not by_day) or is_measured(found, measured):
-        found, share, by_day = [np.zeros_like(mask) for mask in found], 0.0, False
-    return Sky(found, share, num_views, far, bool(by_day))
+    if not is_told or too_little or is_measured(masks, measured):
+        masks, share, by_day = [np.zeros_like(mask) for mask in masks], 0.0, False
+    return Sky(masks, share, num_views, far, by_day, blown_out)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What of a picture may be sky: if pale [H, W], and if there is a blue one [H, W].
+
+    is_far: whether what is pale borders on what is far; None where nothing is known of that. blue:
+    `_Look.blue`. blown_out: what share of the picture is so, and pale.
+    """
+
+    pale: Bools
+    by_day: Bools
+    is_far: bool | None
+    blue: tuple[float, float]
+    blown_out: float
+
+
+def _found(look: _Look, picture: Bytes, z: NDArray[np.float32]) -> _Found:
+    pale = look.sky()
+    is_far: bool | None = None
+    if pale.any() and (z > 0).any():
+        ring = grown(pale, _RING_TO_PX) & ~grown(pale, _RING_FROM_PX) & (z > 0)
+        farthest = np.percentile(z[ring], _FAR_PERCENT) if ring.any() else 0.0
+        is_far = bool(farthest >= _FAR * np.median(z[z > 0]))
+    blown_out = float((pale & (picture.min(axis=-1) >= _BLOWN_OUT)).mean())
+    return _Found(pale, look.sky_by_day(), is_far, look.blue(), blown_out)
 
 
 def like_sky(
@@ -176,7 +205,9 @@ class _Look:
         inside = np.bincount(
             seen.labels[seen.inside], num_points[seen.inside], minlength=len(seen.mean)
         )
-        bare = (seen.area > 0) & (inside <= _MOST_POINTS * seen.num_inside)
+        is_blown = seen.mean.min(axis=-1) >= _BLOWN_OUT / 255.0
+        most = np.where(is_blown, _MOST_BEFORE_BLOWN, _MOST_POINTS)
+        bare = (seen.area > 0) & (inside <= most * seen.num_inside)
         return cls(seen, _elevation(view, up), num_points, bare)
 
     def sky(self) -> Bools:

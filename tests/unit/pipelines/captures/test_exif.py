@@ -74,6 +74,32 @@ def test_sensor_is_as_long_as_its_pixels_at_their_density() -> None:
     assert read_exif(reopened(exif=with_detail(**tags))).sensor_mm == pytest.approx(36.0)
 
 
+def exposure(time_s: Any, f_number: Any, iso: Any) -> float | None:
+    tags = {"x829A": time_s, "x829D": f_number, "x8827": iso}
+    return read_exif(reopened(exif=with_detail(**tags))).exposure_value
+
+
+def test_exposure_is_told_as_one_number() -> None:
+    """Sunny 16: f/16 for 1/100 s at ISO 100 is 14.6; and a room, f/1.8 for 1/30 s at ISO 400."""
+    assert exposure(IFDRational(1, 100), IFDRational(16, 1), 100) == 14.6
+    assert exposure(IFDRational(1, 30), IFDRational(18, 10), 400) == 4.6
+    # A short time is not rounded away.
+    assert exposure(IFDRational(1, 32000), IFDRational(2, 1), 100) == 17.0
+
+
+@pytest.mark.parametrize(
+    ("time_s", "f_number", "iso"),
+    [
+        (IFDRational(0, 1), IFDRational(2, 1), 100),
+        (IFDRational(1, 0), IFDRational(2, 1), 100),
+        (IFDRational(1, 60), IFDRational(0, 0), 100),
+        (IFDRational(1, 60), IFDRational(2, 1), 0),
+    ],
+)
+def test_half_an_exposure_is_none(time_s: Any, f_number: Any, iso: Any) -> None:
+    assert exposure(time_s, f_number, iso) is None
+
+
 @pytest.mark.parametrize(
     "tags",
     [

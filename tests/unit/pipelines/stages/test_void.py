@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pipelines.captures.record import CaptureRecord
 from pipelines.options import AssessOptions
 from pipelines.sample.scene import depth_image, pose_matrix
 from pipelines.sample.scenes import exhibit, monument
@@ -171,3 +172,15 @@ def test_training_lets_light_through_there(trained: Filmed) -> None:
     assert solid[exact == 0].mean() < 0.1
     near = (exact > 0) & (exact < 4.0)
     assert solid[near].mean() > 0.8
+
+
+def test_depth_knows_by_their_exposure_that_photos_were_taken_by_day(tmp_path: Path) -> None:
+    workspace = tiny_job.make_capture(tmp_path / "job", 8, monument.TAKE, 128)
+    folder = workspace.stage("ingest")
+    record = CaptureRecord.load(folder)
+    for image in record.images:
+        image["exif"] = {"exposure_value": 13.2}
+    record.save(folder)
+    summary = tiny_job.run(workspace, "depth", **STEREO)["summary"]
+    assert summary["sky"]["daylight"] is True
+    assert summary["sky"]["share"] > 0.2

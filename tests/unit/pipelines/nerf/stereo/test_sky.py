@@ -21,9 +21,16 @@ from tests.unit.pipelines.nerf.stereo.monument import (
 NO_POINTS = np.zeros((0, 3))
 
 
-def sky_of(seen: list[Seen], points: np.ndarray = NO_POINTS, up: np.ndarray = UP) -> Sky:
+def sky_of(
+    seen: list[Seen],
+    points: np.ndarray = NO_POINTS,
+    up: np.ndarray = UP,
+    *,
+    daylight: bool = False,
+) -> Sky:
     views, depths = [one.view for one in seen], [one.known().z for one in seen]
-    return find_sky(views, lambda index: seen[index].picture, depths, up, points)
+    given = views, lambda index: seen[index].picture, depths, up, points
+    return find_sky(*given, daylight=daylight)
 
 
 @pytest.mark.parametrize("color", [SKY_COLOR, (1.0, 1.0, 1.0), (0.45, 0.65, 0.95)])
@@ -32,10 +39,8 @@ def test_all_of_the_sky_is_found_and_nothing_else(color: tuple[float, float, flo
     found = sky_of(seen)
     assert found.num_views == NUM_VIEWS
     assert found.far == 1.0
-    for one, mask in zip(seen, found.masks, strict=True):
-        assert one.is_void.mean() > 0.2
-        assert mask[one.is_void].mean() > 0.97
-        assert mask[~one.is_void].mean() < 0.01
+    assert all(one.is_void.mean() > 0.2 for one in seen)
+    assert_all_of_the_sky(found, seen)
 
 
 def test_a_white_wall_close_behind_is_no_sky() -> None:
@@ -45,6 +50,70 @@ def test_a_white_wall_close_behind_is_no_sky() -> None:
     assert found.far == 0.0
     assert found.share == 0.0
     assert not any(mask.any() for mask in found.masks)
+
+
+def assert_all_of_the_sky(found: Sky, seen: list[Seen]) -> None:
+    for one, mask in zip(seen, found.masks, strict=True):
+        assert mask[one.is_void].mean() > 0.97
+        assert mask[~one.is_void].mean() < 0.01
+
+
+def test_a_burnt_out_sky_is_known_wherever_it_borders() -> None:
+    """Overcast: the camera exposes for what stands on the ground."""
+    seen = walk_round(houses=7.0, sky=(1.0, 0.99, 1.0))
+    found = sky_of(seen)
+    assert found.far == 0.0
+    assert found.blown_out > 0.2
+    assert not found.by_day
+    assert_all_of_the_sky(found, seen)
+
+
+def test_a_burnt_out_window_or_lamp_is_no_sky() -> None:
+    """Of a room with a white ceiling, a part of which is as bright as light can be."""
+    seen = []
+    for one in walk_round(houses=7.0):
+        rows, columns = np.mgrid[: one.picture.shape[0], : one.picture.shape[1]]
+        lamp = (rows < 30) & (np.abs(columns - 20) < 8) & one.is_void
+        assert 0.01 < lamp.mean() < 0.05
+        seen.append(painted(one, lamp, np.ones(3)))
+    found = sky_of(seen)
+    assert found.num_views == NUM_VIEWS
+    assert found.share == 0.0
+
+
+def test_points_before_what_is_burnt_out_are_wrong_or_hidden() -> None:
+    """A few, as of a tree behind the house: nothing that is white all over shows any."""
+    rng = np.random.default_rng(0)
+    away = rng.normal(size=(600, 3)) * [1.0, 1.0, 0.5]
+    points = 9.0 * away / np.linalg.norm(away, axis=1, keepdims=True)
+    white, grey = walk_round(sky=(1.0, 1.0, 1.0)), walk_round()
+    shown = [(one.is_void[one.view.seen_at(points)[1:]]).sum() / one.is_void.sum() for one in white]
+    assert 1.2e-3 < np.mean(shown) < 4e-3
+    assert sky_of(white, points).share > 0.2
+    assert sky_of(grey, points).share < 0.5 * sky_of(white, points).share
+
+
+def test_what_a_sensor_measures_is_no_burnt_out_sky() -> None:
+    seen = walk_round(houses=7.0, sky=(1.0, 1.0, 1.0))
+    given = [one.view for one in seen], lambda index: seen[index].picture
+    depths = [one.known().z for one in seen]
+    hall = [np.where(one.is_void, np.float32(9.0), one.depth) for one in seen]
+    assert find_sky(*given, depths, UP, NO_POINTS, hall, daylight=True).share == 0.0
+    assert find_sky(*given, depths, UP, NO_POINTS, [None] * len(seen)).share > 0.2
+
+
+def test_photos_taken_by_day_know_their_sky_wherever_it_borders() -> None:
+    seen = walk_round(houses=7.0)
+    assert sky_of(seen).share == 0.0
+    found = sky_of(seen, daylight=True)
+    assert found.far == 0.0
+    assert found.blown_out == 0.0
+    assert_all_of_the_sky(found, seen)
+
+
+@pytest.mark.parametrize("color", [(0.98, 0.92, 0.85), (0.6, 0.6, 0.6)])
+def test_by_day_not_all_that_is_plain_is_sky(color: tuple[float, float, float]) -> None:
+    assert sky_of(walk_round(houses=7.0, sky=color), daylight=True).share == 0.0
 
 
 @pytest.mark.parametrize("color", [(0.98, 0.92, 0.85), (0.6, 0.6, 0.6), (0.2, 0.25, 0.95)])
@@ -129,9 +198,7 @@ def by_day(above: np.ndarray = ZENITH, houses: float = 7.0) -> list[Seen]:
 
 def assert_known_by_day(found: Sky, seen: list[Seen]) -> None:
     assert found.by_day
-    for one, mask in zip(seen, found.masks, strict=True):
-        assert mask[one.is_void].mean() > 0.97
-        assert mask[~one.is_void].mean() < 0.01
+    assert_all_of_the_sky(found, seen)
 
 
 def test_a_blue_sky_is_known_without_anything_far_behind() -> None:
