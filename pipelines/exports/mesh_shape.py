@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from pipelines.errors import ExportError, ToolError
 from pipelines.exports.chosen_crop import chosen_crop
 from pipelines.exports.crop import Crop, cropped, empty_crop, narrowed, surface_in
@@ -41,9 +43,9 @@ from pipelines.exports.surface.shells import (
 )
 from pipelines.exports.surface.views import known_depths, render_views
 from pipelines.exports.surface.watertight import is_closed, made_watertight, why_open
+from pipelines.exports.void import void_of_photos
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
-from pipelines.scene.depth_maps_file import DepthMapsFile
 from pipelines.scene.depth_views import Floats, Pinhole, ViewStore
 from pipelines.scene.known_depths import KnownDepths
 from pipelines.scene.stereo_views import ColorView, color_view, stereo_view, view_of
@@ -218,19 +220,11 @@ def _on_the_edges(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) ->
 
 def _out_of_the_void(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
     """The mesh without what stands before the sky or the blank ground that `depth` told of."""
-    if not ctx.workspace.is_complete("depth"):
-        return mesh
-    told = ctx.workspace.manifest("depth")["summary"]
-    # What is dark may be something that nobody saw.
-    if told.get("dark", {}).get("share") or not any(
-        told.get(kind, {}).get("share") for kind in ("blank", "sky")
-    ):
-        return mesh
     images = {image.file: image for image in scene.training_images()}
     views = (
-        (view_of(images[item.file], item.lens, found.z), found.is_void)
-        for item, found in DepthMapsFile(ctx.workspace.stage("depth"))
-        if item.file in images
+        (view_of(images[void.file], void.lens, void.is_void.astype(np.float32)), void.is_void)
+        for void in void_of_photos(ctx.workspace)
+        if void.file in images
     )
     return carved(mesh, views, ctx.check_cancelled)
 

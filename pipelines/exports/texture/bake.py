@@ -24,6 +24,7 @@ from pipelines.exports.texture.levelling import levels
 from pipelines.exports.texture.photos import Photos, colors_at, softened
 from pipelines.exports.texture.refining import refine
 from pipelines.exports.texture.texels import ROWS, moving, spread, texels_of
+from pipelines.exports.void import void_of_photos
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
@@ -61,7 +62,7 @@ def painted(
     def on_progress(done: float) -> None:
         ctx.progress(begin + (end - begin) * done, "painting", None)
 
-    photos = Photos(ctx.workspace.images_root, images, lenses)
+    photos = Photos(ctx.workspace.images_root, images, lenses, void_of_photos(ctx.workspace))
     try:
         if options.texture == "field":
             if scene is None:

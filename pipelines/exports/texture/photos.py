@@ -7,7 +7,7 @@ those of the stored photo, lens distortion and all; the centre of the top-left o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
+from pipelines.exports.void import Void
+from pipelines.nerf.data.depth_maps import DepthMaps
 from pipelines.nerf.data.light import light_table
 from pipelines.nerf.space.cameras import SceneTransform
 from pipelines.nerf.space.lenses import EQUIRECTANGULAR
@@ -33,16 +35,40 @@ _USABLE = 128
 
 
 class Photos:
-    """N posed photos. origin: of the frame in which points are given, world."""
+    """N posed photos, of which nothing is painted that shows nothing.
+
+    frame: in which points are given: the world less an origin. void: of some of the photos, what
+    shows that nothing stands there.
+    """
 
     def __init__(
-        self, root: Path, images: Sequence[PosedImage], lenses: Sequence[Intrinsics]
+        self,
+        root: Path,
+        images: Sequence[PosedImage],
+        lenses: Sequence[Intrinsics],
+        void: Iterable[Void] = (),
     ) -> None:
         poses = np.asarray([image.world_from_camera for image in images], np.float64)
         self._root = root
         self._images = list(images)
         self.frame = SceneTransform.fit(poses[:, :, 3], scale_poses=False)
         self._cameras = nerf_cameras(lenses, poses, self.frame)
+        index_of = {image.file: index for index, image in enumerate(images)}
+        self._void = {
+            index_of[one.file]: self._as_stored(index_of[one.file], one)
+            for one in void
+            if one.file in index_of and one.is_void.any()
+        }
+
+    def _as_stored(self, index: int, void: Void) -> Bools:
+        """[h, w]: what is void in the photo as it is stored, lens distortion and all, small."""
+        camera = self._cameras.select([index]).resized(max(void.is_void.shape))
+        lens = void.lens
+        mask = void.is_void.astype(np.float32)
+        maps = DepthMaps.from_arrays([mask], [(lens.fl_x, lens.fl_y, lens.cx, lens.cy)], 1.0)
+        width, height = camera.size[0].tolist()
+        seen: Bools = (maps.distances(camera.image_rays(0), camera) > 0.0).numpy()
+        return seen.reshape(int(height), int(width))
 
     def __len__(self) -> int:
         return len(self._images)
@@ -105,8 +131,8 @@ class Photos:
         return photo if light is None else photo.point(light_table(light).T.reshape(-1).tolist())
 
     def usable(self, index: int, pixels: Floats) -> Bools:
-        """Whether the photo's mask, and what it was cut out by, let pixels [P, 2] count; all of
-        them without any."""
+        """Whether the photo's mask, what it was cut out by, and what of it is void let pixels
+        [P, 2] count; all of them without any."""
         image = self._images[index]
         kept: Bools = np.ones(len(pixels), np.bool_)
         for mask in (image.mask, image.cut):
@@ -116,6 +142,11 @@ class Photos:
                 shown = np.asarray(opened.convert("L")) >= _USABLE
             columns, rows = np.clip(pixels, 0, np.array(shown.shape[::-1]) - 1).astype(int).T
             kept &= shown[rows, columns]
+        void = self._void.get(index)
+        if void is not None:
+            share = np.array(void.shape[::-1]) / self.size(index)
+            columns, rows = np.clip(pixels * share, 0, np.array(void.shape[::-1]) - 1).astype(int).T
+            kept &= ~void[rows, columns]
         return kept
 
 

@@ -21,7 +21,7 @@ from pipelines.nerf.stereo.views import StereoView
 
 _MOST_MEASURED = 0.2
 """A sensor measures no more of it."""
-_RIM_PX = 1
+RIM_PX = 1
 """Pixels of a mask so near to its border may show what stands before it."""
 _BEHIND_ALL = 1e3
 """How far what is nothing is to be thought of, in the largest depth that is known."""
@@ -53,7 +53,7 @@ def without(
     masks: [H, W] of each view. Their pixels, but for those at their rims, have `VOID` for votes.
     on_share: told the share that is done; may raise.
     """
-    void = [shrunk(mask, _RIM_PX) for mask in masks]
+    void = [shrunk(mask, RIM_PX) for mask in masks]
     cleared = shelves.scratch("without void", len(views))
     beyond = shelves.scratch("void alone", len(views))
     farthest = np.float32(_BEHIND_ALL * max(float(z.max(initial=0.0)) for z in maps.z))

@@ -12,7 +12,10 @@ from pipelines.errors import Cancelled
 from pipelines.exports.mesh import TexturedMesh
 from pipelines.exports.texture import bake, texels
 from pipelines.exports.texture.bake import texture_from_photos
+from pipelines.exports.texture.photos import Photos
+from pipelines.exports.void import Void
 from pipelines.judging.asset_views import MeshCaster, Texture
+from pipelines.scene.depth_views import Pinhole
 from tests.unit.pipelines.exports.texture import painted_ball
 from tests.unit.pipelines.exports.texture.painted_ball import CENTER, stripes
 
@@ -113,6 +116,28 @@ def test_a_masked_part_of_the_photos_colours_nothing(tmp_path: Path) -> None:
     hidden = shown & (pixels[:, 0] < painted_ball.SIDE / 2 - 12)
     assert hidden.sum() > 100
     assert np.abs(found[hidden] - 0.5).max() < 0.01
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.25])
+def test_what_of_a_photo_is_void_colours_nothing(tmp_path: Path, k1: float) -> None:
+    """Told in the undistorted picture, of a part of it on the left."""
+    lens = dataclasses.replace(painted_ball.LENS, model="OPENCV", k1=k1)
+    image = painted_ball.write_photos(tmp_path, [painted_ball.all_round()[1]])[0]
+    plain, edge = Pinhole.of(lens, 64), 20
+    left = np.broadcast_to(np.arange(64) < edge, (64, 64))
+    photos = Photos(tmp_path, [image], [lens], [Void(image.file, plain, left)])
+    textured = texture_from_photos(painted_ball.ball(48), photos, 2048)
+    points, found, _ = surface_samples(textured)
+    _, shown = photos.pixels(0, photos.frame.scene_from_world(points))
+    pose = np.asarray(image.world_from_camera)
+    x, _, z = ((points - pose[:, 3]) @ pose[:, :3]).T
+    column = plain.cx - plain.fl_x * x / z
+    colored = np.abs(found - 0.5).max(axis=-1) > 0.02
+    hidden, kept = shown & (column < edge - 3), shown & (column > edge + 3)
+    facing = ((points - CENTER) * (pose[:, 3] - points)).sum(axis=-1) > 0.5
+    assert (hidden & facing).sum() > 100
+    assert not colored[hidden].any()
+    assert colored[kept & facing].mean() > 0.9
 
 
 def test_where_nothing_lies_the_picture_is_no_darker_than_the_mesh(tmp_path: Path) -> None:
