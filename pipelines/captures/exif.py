@@ -25,7 +25,7 @@ from pipelines.captures.attitude import Direction, measured_up
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _TAKEN_AT, _FOCAL_MM, _FOCAL_35MM, _LENS = 0x9003, 0x920A, 0xA405, 0xA434
 _MAKERS_NOTE = 0x927C
-_EXPOSURE_S, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
+_EXPOSURE_S, _F_NUMBER, _ISO, _FLASH = 0x829A, 0x829D, 0x8827, 0x9209
 _PIXELS_X, _PIXELS_Y = 0xA002, 0xA003
 _PLANE_X, _PLANE_Y, _PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
 _ON_ITS_SIDE = 5
@@ -44,7 +44,8 @@ class Exif:
     orientation: 1 to 8, of the pixels as sent. taken_at: "YYYY:MM:DD HH:MM:SS", the camera's clock.
     up: the direction away from gravity, unit, as in `pipelines.captures.attitude`.
     exposure_value: at ISO 100, log2(N^2 / t) - log2(S / 100) for f-number N, time t in seconds, and
-    speed S: 12 to 16 outdoors by day, 3 to 8 in rooms, more where the sun shines in.
+    speed S: 12 to 16 outdoors by day, 3 to 8 in rooms, more where the sun shines in. None where a
+    flash was the light.
     """
 
     make: str | None = None
@@ -140,7 +141,10 @@ def _length(value: Any) -> float | None:
 
 
 def _exposure_value(detail: Any) -> float | None:
-    """At ISO 100, to a tenth, or None where a part of it is not known."""
+    """At ISO 100, to a tenth, or None where a part of it is not known, or a flash fired."""
+    flash = detail.get(_FLASH)
+    if isinstance(flash, int) and flash & 1:
+        return None
     speed = detail.get(_ISO)
     speed = speed[0] if isinstance(speed, tuple) and speed else speed
     time_s, f_number, iso = map(_positive, (detail.get(_EXPOSURE_S), detail.get(_F_NUMBER), speed))

@@ -74,8 +74,8 @@ def test_sensor_is_as_long_as_its_pixels_at_their_density() -> None:
     assert read_exif(reopened(exif=with_detail(**tags))).sensor_mm == pytest.approx(36.0)
 
 
-def exposure(time_s: Any, f_number: Any, iso: Any) -> float | None:
-    tags = {"x829A": time_s, "x829D": f_number, "x8827": iso}
+def exposure(time_s: Any, f_number: Any, iso: Any, **more: Any) -> float | None:
+    tags = {"x829A": time_s, "x829D": f_number, "x8827": iso, **more}
     return read_exif(reopened(exif=with_detail(**tags))).exposure_value
 
 
@@ -85,6 +85,12 @@ def test_exposure_is_told_as_one_number() -> None:
     assert exposure(IFDRational(1, 30), IFDRational(18, 10), 400) == 4.6
     # A short time is not rounded away.
     assert exposure(IFDRational(1, 32000), IFDRational(2, 1), 100) == 17.0
+
+
+def test_how_bright_it_was_is_not_known_of_what_a_flash_lit() -> None:
+    by_flash = IFDRational(1, 200), IFDRational(8, 1), 200
+    assert exposure(*by_flash, x9209=0x19) is None  # fired, by itself
+    assert exposure(*by_flash, x9209=0x18) == 12.6  # did not
 
 
 @pytest.mark.parametrize(
