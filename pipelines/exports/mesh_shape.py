@@ -15,8 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from pipelines.errors import ExportError, ToolError
 from pipelines.exports.chosen_crop import chosen_crop
 from pipelines.exports.crop import Crop, cropped, empty_crop, narrowed, surface_in
@@ -29,7 +27,7 @@ from pipelines.exports.reduction import reduced
 from pipelines.exports.subject import Decision, Thing
 from pipelines.exports.subject_files import as_dict
 from pipelines.exports.subject_search import SEARCH_SHARE, look_at_one_place, search_subject
-from pipelines.exports.surface.carving import carved
+from pipelines.exports.surface.carving import Seen, carved
 from pipelines.exports.surface.holes import close_holes, hole_limits
 from pipelines.exports.surface.outlines import outlined
 from pipelines.exports.surface.refinement import refined
@@ -221,12 +219,12 @@ def _on_the_edges(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) ->
 def _out_of_the_void(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
     """The mesh without what stands before the sky or the blank ground that `depth` told of."""
     images = {image.file: image for image in scene.training_images()}
-    views = (
-        (view_of(images[void.file], void.lens, void.is_void.astype(np.float32)), void.is_void)
+    photos = (
+        Seen(view_of(images[void.file], void.lens, void.z), void.is_void, void.z)
         for void in void_of_photos(ctx.workspace)
         if void.file in images
     )
-    return carved(mesh, views, ctx.check_cancelled)
+    return carved(mesh, photos, ctx.check_cancelled)
 
 
 def _photos(

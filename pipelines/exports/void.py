@@ -16,11 +16,13 @@ from pipelines.workspace import Workspace
 
 
 class Void(NamedTuple):
-    """file: the image, as in `cameras.json`. is_void: [H, W], as a pinhole in its place sees it."""
+    """file: the image, as in `cameras.json`. lens: of a pinhole in its place, which sees is_void
+    [H, W] and what is known of depth, z [H, W], 0 where nothing is."""
 
     file: str
     lens: Pinhole
     is_void: NDArray[np.bool_]
+    z: NDArray[np.float32]
 
 
 def void_of_photos(workspace: Workspace) -> Iterator[Void]:
@@ -36,4 +38,4 @@ def void_of_photos(workspace: Workspace) -> Iterator[Void]:
     if shares["dark"] or not (shares["sky"] or shares["blank"]):
         return
     for image, found in DepthMapsFile(workspace.stage("depth")):
-        yield Void(image.file, image.lens, grown(found.is_void, RIM_PX))
+        yield Void(image.file, image.lens, grown(found.is_void, RIM_PX), found.z)

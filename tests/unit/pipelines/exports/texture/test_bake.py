@@ -125,7 +125,9 @@ def test_what_of_a_photo_is_void_colours_nothing(tmp_path: Path, k1: float) -> N
     image = painted_ball.write_photos(tmp_path, [painted_ball.all_round()[1]])[0]
     plain, edge = Pinhole.of(lens, 64), 20
     left = np.broadcast_to(np.arange(64) < edge, (64, 64))
-    photos = Photos(tmp_path, [image], [lens], [Void(image.file, plain, left)])
+    photos = Photos(
+        tmp_path, [image], [lens], [Void(image.file, plain, left, np.zeros((64, 64), np.float32))]
+    )
     textured = texture_from_photos(painted_ball.ball(48), photos, 2048)
     points, found, _ = surface_samples(textured)
     _, shown = photos.pixels(0, photos.frame.scene_from_world(points))
