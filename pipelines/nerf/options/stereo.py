@@ -45,8 +45,9 @@ class StereoConfig:
     )
     find_sky: bool = option(
         True,
-        "Tell the sky from what stands before it, where it is blue, or things before a far "
-        "background are seen against it: it has no depth, and training lets light through there.",
+        "Tell the sky from what stands before it, where it is blue or burnt out, photos were "
+        "exposed for daylight, or things before a far background are seen against it: it has no "
+        "depth, and training lets light through there.",
     )
     find_dark: bool = option(
         True,
