@@ -4,9 +4,9 @@ Kept, in `capture.json`: what tells lenses apart and gives their focal length (m
 focal lengths, width of the sensor), how the stored pixels were turned, which way was up, as far as
 the device had measured that, how bright it was, and when the photo was taken by the camera's clock.
 Poses need the first for one camera model a lens and a focal length to start from, the search for
-the sky how bright it was. Everything else is dropped,
-above all what says where a photo was taken or by whose device: GPS, serial numbers, owner,
-thumbnails, the rest of the maker's notes. Numbers that no lens has are left out.
+the sky how bright it was. Everything else is dropped, above all what says where a photo was taken
+or by whose device: GPS, serial numbers, owner, thumbnails, the rest of the maker's notes. Numbers
+that no lens has are left out.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from pipelines.captures.attitude import Direction, measured_up
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _TAKEN_AT, _FOCAL_MM, _FOCAL_35MM, _LENS = 0x9003, 0x920A, 0xA405, 0xA434
 _MAKERS_NOTE = 0x927C
+_MOST_EXPOSURE = 30.0
+"""Of stars and of the sun, to either side."""
 _EXPOSURE_S, _F_NUMBER, _ISO, _FLASH = 0x829A, 0x829D, 0x8827, 0x9209
 _PIXELS_X, _PIXELS_Y = 0xA002, 0xA003
 _PLANE_X, _PLANE_Y, _PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
@@ -150,7 +152,9 @@ def _exposure_value(detail: Any) -> float | None:
     time_s, f_number, iso = map(_positive, (detail.get(_EXPOSURE_S), detail.get(_F_NUMBER), speed))
     if time_s is None or f_number is None or iso is None:
         return None
-    return round(math.log2(f_number**2 / time_s) - math.log2(iso / 100.0), 1)
+    # Sums of logarithms: the numbers may be as large and small as floats are.
+    value = 2.0 * math.log2(f_number) - math.log2(time_s) - math.log2(iso) + math.log2(100.0)
+    return round(value, 1) if abs(value) <= _MOST_EXPOSURE else None
 
 
 def _sensor(detail: Any) -> float | None:

@@ -94,6 +94,21 @@ def test_how_bright_it_was_is_not_known_of_what_a_flash_lit() -> None:
 
 
 @pytest.mark.parametrize(
+    ("time_s", "f_number"), [(0.01, 1e300), (1e-310, 2.0), (5e-324, 1e308), (1e300, 2.0)]
+)
+def test_an_exposure_beyond_all_bounds_takes_nothing_with_it(
+    time_s: float, f_number: float
+) -> None:
+    """Of tags that hold doubles: neither an error, nor a number that JSON does not know."""
+    exif = PIL.Image.Exif()
+    detail = {0x829A: time_s, 0x829D: f_number, 0x8827: 100, 0x920A: 5.7}
+    exif.get_ifd(0x8769).update(detail)
+    image = PIL.Image.new("RGB", (8, 8))
+    image.getexif = lambda: exif  # type: ignore[method-assign]
+    assert read_exif(image) == Exif(focal_mm=5.7)
+
+
+@pytest.mark.parametrize(
     ("time_s", "f_number", "iso"),
     [
         (IFDRational(0, 1), IFDRational(2, 1), 100),
