@@ -53,7 +53,9 @@ class Photos:
         self._images = list(images)
         self.frame = SceneTransform.fit(poses[:, :, 3], scale_poses=False)
         self._cameras = nerf_cameras(lenses, poses, self.frame)
-        index_of = {image.file: index for index, image in enumerate(images)}
+        # What a photo was cut out by says it to the pixel.
+        uncut = (index for index, image in enumerate(images) if image.cut is None)
+        index_of = {images[index].file: index for index in uncut}
         self._void = {
             index_of[one.file]: self._as_stored(index_of[one.file], one)
             for one in void
