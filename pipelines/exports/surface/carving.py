@@ -54,8 +54,7 @@ def carved(
     ]
     hull = _Hull(sure, poll)
     empty = hull.is_empty(mesh.vertices)
-    kept = ~empty[mesh.faces].all(axis=1)
-    if not empty.any() or not kept.any():
+    if not empty.any() or empty[mesh.faces].all():
         return mesh
     return _cut(mesh, empty, hull)
 

@@ -115,8 +115,8 @@ def find_sky(
 
     def look(index: int) -> _Found:
         parts = shelved_patches(views[index], index, patches)
-        picture = picture_of(index)
-        return _found(_Look.at(views[index], picture, up, points, parts), picture, depths[index])
+        seen = _Look.at(views[index], picture_of(index), up, points, parts)
+        return _found(seen, depths[index])
 
     found = []
     for one in each_ahead(look, range(len(views))):
@@ -152,14 +152,14 @@ class _Found:
     blown_out: float
 
 
-def _found(look: _Look, picture: Bytes, z: NDArray[np.float32]) -> _Found:
+def _found(look: _Look, z: NDArray[np.float32]) -> _Found:
     pale = look.sky()
     is_far: bool | None = None
     if pale.any() and (z > 0).any():
         ring = grown(pale, _RING_TO_PX) & ~grown(pale, _RING_FROM_PX) & (z > 0)
         farthest = np.percentile(z[ring], _FAR_PERCENT) if ring.any() else 0.0
         is_far = bool(farthest >= _FAR * np.median(z[z > 0]))
-    blown_out = float((pale & (picture.min(axis=-1) >= _BLOWN_OUT)).mean())
+    blown_out = float((pale & (look.seen.picture.min(axis=-1) >= _BLOWN_OUT)).mean())
     return _Found(pale, look.sky_by_day(), is_far, look.blue(), blown_out)
 
 
