@@ -95,7 +95,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                     },
                     "pointcloud": {"num_points": 200_000},
                     "mesh": {"render_long_side_px": 240},
-                    "video": {"num_frames": 96, "long_side_px": 480},
+                    "video": {"num_frames": 120, "long_side_px": 960, "field_px": 320},
                 },
             ),
             Preset(
@@ -124,7 +124,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                         "render_long_side_px": 480,
                         "max_faces": 400_000,
                     },
-                    "video": {"num_frames": 144, "long_side_px": 720},
+                    "video": {"num_frames": 144, "long_side_px": 1280, "field_px": 480},
                 },
             ),
             Preset(

@@ -20,12 +20,17 @@ from pipelines.exports.flight_options import FlightOptions
 from pipelines.exports.formats.mp4 import VideoWriter
 from pipelines.exports.formats.png_frames import FramesWriter
 from pipelines.exports.paths.flight import Flight
-from pipelines.exports.shots import Lens, MeshStudio, Shot, shot_of
+from pipelines.exports.shots import Lens, Shot, shot_of, within
+from pipelines.scene.cameras_file import Intrinsics
+from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.stage import StageContext
 
 Floats = NDArray[np.float64]
-Frames = dict[str, NDArray[np.uint8]]
+Bytes = NDArray[np.uint8]
+Frames = dict[str, Bytes]
+Painter = Callable[[Pinhole | Intrinsics, Floats, NDArray[np.bool_] | None], Bytes]
+"""`(lens, pose, circle) -> [H, W, 3]`, as `MeshStudio.picture`."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +72,13 @@ def make_film(
     flight: Flight,
     lens: Lens,
     ctx: StageContext,
-    mesh: MeshStudio | None = None,
+    painters: Mapping[str, Painter],
 ) -> None:
-    """Render and write all frames. mesh: for the output of that name. Raises ToolError."""
-    draw = _drawer(scene, film, lens, ctx, mesh)
+    """Render and write all frames. Raises ToolError.
+
+    painters: by output, where something else than a shot of the trained scene draws it.
+    """
+    draw = _drawer(scene, film, lens, ctx, painters)
     started, count = time.monotonic(), len(flight)
     with _writer(film, ctx, lens) as write:
         for index, pose in enumerate(flight.poses):
@@ -81,14 +89,14 @@ def make_film(
 
 
 def _drawer(
-    scene: TrainedScene, film: Film, lens: Lens, ctx: StageContext, mesh: MeshStudio | None
+    scene: TrainedScene, film: Film, lens: Lens, ctx: StageContext, painters: Mapping[str, Painter]
 ) -> Callable[[int, Floats], Frames]:
     """What draws a frame of each output."""
     between = None
     if "depth" in film.outputs:
         ctx.progress(0.0, "looking for the range of depths")
         between = shades.range_of_views(scene.probe_views(ctx.check_cancelled))
-    painters: dict[str, Callable[[Shot], NDArray[np.uint8]]] = {
+    of_shot: dict[str, Callable[[Shot], Bytes]] = {
         "rgb": lambda shot: shot.rgb,
         "depth": lambda shot: shades.depth_picture(shot.depth, between),
         "normals": lambda shot: shades.normals_picture(shot.normals()),
@@ -97,18 +105,12 @@ def _drawer(
 
     def draw(index: int, pose: Floats) -> Frames:
         seen_through, circle = lens.of(index), lens.circle(index)
-        frames: Frames = {}
-        if set(film.outputs) != {"mesh"}:
+        frames = {name: paint(seen_through, pose, circle) for name, paint in painters.items()}
+        of_scene = [name for name in film.outputs if name not in painters]
+        if of_scene:
             shot = shot_of(scene, seen_through, pose, circle)
-            frames = {name: painters[name](shot) for name in film.outputs if name != "mesh"}
-            if circle is not None:
-                # What is unknown is grey; beyond the circle there is nothing to know.
-                frames = {
-                    name: np.where(circle[..., None], picture, np.uint8(0))
-                    for name, picture in frames.items()
-                }
-        if mesh is not None:
-            frames["mesh"] = mesh.picture(seen_through, pose, circle)
+            # What is unknown is grey; beyond the circle there is nothing to know.
+            frames |= {name: within(circle, of_shot[name](shot)) for name in of_scene}
         return {name: frames[name] for name in film.outputs}
 
     return draw

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from pipelines.exports import shades
 from pipelines.exports.flight_options import FlightOptions
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+from pipelines.exports.mixing import enlarged, mixed
 from pipelines.exports.paths.flight import Flight, lens_of_size
-from pipelines.judging.asset_views import MeshCaster, Texture
+from pipelines.judging.asset_views import AssetView, MeshCaster, Texture
 from pipelines.nerf.space.cameras import SceneTransform, panorama_intrinsics
 from pipelines.scene.cameras_file import Intrinsics
 from pipelines.scene.depth_views import Pinhole, surface_distance, without_jumps
@@ -142,13 +143,51 @@ class MeshStudio:
         colors = Texture(mesh.uv, mesh.texture) if isinstance(mesh, TexturedMesh) else mesh.colors
         self._caster = MeshCaster(self._frame.scene_from_world(mesh.vertices), mesh.faces, colors)
 
+    def view(self, lens: Intrinsics, pose: Floats, samples: int = 1) -> AssetView:
+        """What a lens sees of the mesh from a world pose, both sides of its faces."""
+        return self._caster.view(nerf_cameras([lens], [pose], self._frame), 0, samples=samples)
+
     def picture(
         self, lens: Pinhole | Intrinsics, pose: Floats, circle: NDArray[np.bool_] | None = None
     ) -> Bytes:
-        """[H, W, 3]: the mesh from a world pose, both sides of its faces."""
-        full = lens.intrinsics() if isinstance(lens, Pinhole) else lens
-        view = self._caster.view(nerf_cameras([full], [pose], self._frame), 0, samples=_SAMPLES)
+        """[H, W, 3]: the mesh alone."""
+        view = self.view(intrinsics_of(lens), pose, _SAMPLES)
         picture = np.where(view.hit[..., None], as_uint8(view.color), np.uint8(_AROUND_MESH))
-        if circle is not None:
-            picture = np.where(circle[..., None], picture, np.uint8(0))
-        return picture
+        return within(circle, picture)
+
+
+class MixedStudio:
+    """A trained scene and its mesh, to be filmed as one (`pipelines.exports.mixing`).
+
+    mesh: None for a scene that has none; then what was trained on is enlarged. field_px: long side
+        at which the scene is rendered; the mesh is at the film's.
+    """
+
+    def __init__(self, scene: TrainedScene, mesh: MeshStudio | None, field_px: int) -> None:
+        self._scene = scene
+        self._mesh = mesh
+        self._field_px = field_px
+        self.has_mesh = mesh is not None
+
+    def picture(
+        self, lens: Pinhole | Intrinsics, pose: Floats, circle: NDArray[np.bool_] | None = None
+    ) -> Bytes:
+        """[H, W, 3]: both."""
+        full = intrinsics_of(lens)
+        long_side = min(self._field_px, max(full.width, full.height))
+        field = as_array(self._scene.render(full, pose, long_side).rgb)
+        if self._mesh is None:
+            shown = enlarged(field, full.height, full.width)
+        else:
+            shown = mixed(field, self._mesh.view(full, pose))
+        return within(circle, as_uint8(shown))
+
+
+def intrinsics_of(lens: Pinhole | Intrinsics) -> Intrinsics:
+    """The lens as one of `cameras.json`."""
+    return lens.intrinsics() if isinstance(lens, Pinhole) else lens
+
+
+def within(circle: NDArray[np.bool_] | None, picture: Bytes) -> Bytes:
+    """The picture, black where a fisheye shows nothing."""
+    return picture if circle is None else np.where(circle[..., None], picture, np.uint8(0))

@@ -76,7 +76,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
         pictures="mesh-video-frames.zip",
         together=len(options.outputs) > 1,
     )
-    make_film(scene, film, flight, lens, ctx, studio)
+    make_film(scene, film, flight, lens, ctx, {"mesh": studio.picture})
     return film.told(len(flight), lens, ctx.out)
 
 

@@ -1,7 +1,9 @@
 """The video: a flight along a path of the catalogue, as colours, depth, normals or accumulation.
 
-H.264 for any browser, HEVC, AV1, or a zip of PNG files; through a perspective lens, a fisheye, or
-all round. `preview.jpg` is a telling moment of the flight at up to twice the video's size.
+Colours are drawn from the trained scene and the job's mesh together, where that has the photos on
+it (`pipelines.exports.mixing`): finer than the scene alone, and in less time. H.264 for any
+browser, HEVC, AV1, or a zip of PNG files; through a perspective lens, a fisheye, or all round.
+`preview.jpg` is a telling moment of the flight at up to twice the video's size.
 """
 
 from __future__ import annotations
@@ -12,9 +14,11 @@ from pydantic import Field, field_validator
 
 from pipelines.exports.export import Export
 from pipelines.exports.flight_options import FlightOptions
+from pipelines.exports.paths.options import MAX_SIDE_PX
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
+    from pipelines.exports.shots import MixedStudio
     from pipelines.scene.trained_scene import TrainedScene
 
 Output = Literal["rgb", "depth", "normals", "accumulation"]
@@ -36,6 +40,21 @@ class VideoOptions(FlightOptions):
         "separate",
         description="separate writes video.mp4 with rgb and video-<output>.mp4 with each other "
         "one; side_by_side all of them into video.mp4.",
+    )
+
+    mesh_detail: bool = Field(
+        True,
+        description="Draws the colours from the trained scene and the job's textured mesh, as far "
+        "as they agree: sharper, clearer where few photos leave fog, and faster. A job without "
+        "such a mesh has the scene alone, rendered at the size of the pictures that it was trained "
+        "on and enlarged. Off is the scene alone, rendered at the video's size.",
+    )
+    field_px: int | None = Field(
+        None,
+        ge=16,
+        le=MAX_SIDE_PX,
+        description="With the mesh: long side at which the trained scene is rendered, no larger "
+        "than the video's; null for that of the pictures that it was trained on.",
     )
 
     @field_validator("outputs")
@@ -71,7 +90,9 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
         pictures="video-frames.zip",
         together=together,
     )
-    make_film(scene, film, flight, lens, ctx)
+    studio = _studio(scene, options, ctx)
+    drawn = {"rgb": studio.picture} if studio is not None and "rgb" in options.outputs else {}
+    make_film(scene, film, flight, lens, ctx, drawn)
     ctx.progress(len(flight) / (len(flight) + 4), "preview picture")
     moment = preview_index(flight.poses, images)
     shown = (
@@ -80,16 +101,36 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
         else Pinhole.of(own, max(lens.size))
     )
     long_side = min(_PREVIEW_ENLARGEMENT * max(lens.size), max(own.width, own.height, *lens.size))
-    picture = scene.picture(Pinhole.of(shown.intrinsics(), long_side), flight.poses[moment])
+    shown, pose = Pinhole.of(shown.intrinsics(), long_side), flight.poses[moment]
+    picture = scene.picture(shown, pose) if studio is None else studio.picture(shown, pose)
     Image.fromarray(picture).save(ctx.out / "preview.jpg", quality=_PREVIEW_QUALITY)
-    return film.told(len(flight), lens, ctx.out)
+    with_mesh = studio is not None and studio.has_mesh
+    return {**film.told(len(flight), lens, ctx.out), "mesh_detail": with_mesh}
+
+
+def _studio(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> MixedStudio | None:
+    """What draws scene and mesh together; None where only the scene is asked for."""
+    from pipelines.exports.formats.glb import read_mesh
+    from pipelines.exports.judged import mesh_of
+    from pipelines.exports.mesh import TexturedMesh
+    from pipelines.exports.shots import MeshStudio, MixedStudio
+
+    if not options.mesh_detail:
+        return None
+    trained_px, path = scene.trained_long_side_px, mesh_of(ctx.workspace.stage("mesh"))
+    ctx.progress(0.0, "reading the mesh")
+    mesh = read_mesh(path) if path.is_file() else None
+    if not isinstance(mesh, TexturedMesh):
+        return MixedStudio(scene, None, trained_px)
+    return MixedStudio(scene, MeshStudio(mesh), options.field_px or trained_px)
 
 
 _PLAYER = "any browser or player"
 
 EXPORT = Export(
     kind="video",
-    version=4,
+    version=5,
+    reads=("mesh",),
     run=run,
     options=VideoOptions,
     artifacts=(

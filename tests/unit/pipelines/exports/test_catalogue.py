@@ -33,8 +33,9 @@ def test_an_export_is_a_stage_behind_training(export: Export) -> None:
     before = STAGE_NAMES[: STAGE_NAMES.index("train")]
     assert set(before) >= set(export.reads) - set(others), "of what lies before training"
     assert all(KINDS.index(kind) < KINDS.index(export.kind) for kind in others)
-    assert not others or export.on_request or export.kind == "pointcloud", (
-        "a mesh that fails takes no other export with it but the cloud that lies on it"
+    assert not others or export.on_request or export.kind in ("pointcloud", "video"), (
+        "a mesh that fails takes no other export with it but the cloud that lies on it and the "
+        "film that shows it"
     )
     assert (stage.version, stage.artifacts) == (export.version, export.artifacts)
     assert STAGE_OPTIONS[export.kind] is export.options

@@ -154,6 +154,78 @@ def _pictures(job: Workspace, **changes: Any) -> dict[str, np.ndarray]:
         }
 
 
+def _still(job: Workspace, long_side_px: int, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """A frame from where a photo was taken that training held out, and the summary."""
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    image = next(image for image in cameras.images if image.split == "test")
+    lens = cameras.cameras[image.camera]
+    fov = float(np.degrees(2.0 * np.arctan(lens.height / (2.0 * lens.fl_y))))
+    pose = np.vstack([image.world_from_camera, [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
+    shrink = long_side_px / max(lens.width, lens.height)
+    file = {
+        "fps": 10,
+        "render_width": round(lens.width * shrink),
+        "render_height": round(lens.height * shrink),
+        "camera_path": [{"camera_to_world": pose, "fov": fov}] * 2,
+    }
+    summary = tiny_job.run(
+        job, "video", path="camera_path", camera_path=file, codec="png", **options
+    )["summary"]
+    with zipfile.ZipFile(job.stage("video") / "video-frames.zip") as archive:
+        return np.asarray(Image.open(archive.open("rgb/00001.png"))).astype(float), summary
+
+
+def _held_out_photo(job: Workspace) -> np.ndarray:
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    image = next(image for image in cameras.images if image.split == "test")
+    return np.asarray(Image.open(job.images_root / image.file).convert("RGB")).astype(float)
+
+
+def test_the_mesh_makes_the_film_more_like_photos_that_training_never_saw(job: Workspace) -> None:
+    tiny_job.run(job, "mesh", formats=("glb",))
+    photo = _held_out_photo(job)
+    alone, told = _still(job, 64, mesh_detail=False)
+    assert told["mesh_detail"] is False
+    both, told = _still(job, 64)
+    assert told["mesh_detail"] is True
+    assert both.shape == photo.shape == alone.shape
+    small, _ = _still(job, 64, field_px=32)
+    error, error_small, error_alone = (
+        np.square(picture - photo).mean() for picture in (both, small, alone)
+    )
+    assert error < 0.95 * error_alone
+    assert error < error_small
+
+
+def test_a_job_without_a_picture_on_its_mesh_films_what_was_trained(job: Workspace) -> None:
+    trained, _ = _still(job, 64, mesh_detail=False)
+    for texture in (None, "none"):
+        if texture is not None:
+            tiny_job.run(job, "mesh", formats=("glb",), texture=texture)
+        enlarged, told = _still(job, 128, field_px=32)
+        assert told["mesh_detail"] is False
+        shrunk = enlarged.reshape(64, 2, -1, 2, 3).mean(axis=(1, 3))
+        assert np.abs(shrunk - trained).mean() < 3.0
+        again, _ = _still(job, 64)
+        np.testing.assert_allclose(again, trained, atol=1.0)
+
+
+def test_what_the_mesh_is_not_asked_for_stays_as_it_was(job: Workspace) -> None:
+    before, _ = _still(job, 64, outputs=("rgb", "depth"), mesh_detail=False)
+    depth = _frame(job, "depth")
+    tiny_job.run(job, "mesh", formats=("glb",))
+    after, _ = _still(job, 64, outputs=("depth", "rgb"))
+    np.testing.assert_array_equal(_frame(job, "depth"), depth)
+    assert np.abs(after - before).mean() > 0.5
+    circle = _pictures(job, render_width=64, render_height=64, camera_type="fisheye")["rgb"]
+    assert circle.std() > 5.0
+
+
+def _frame(job: Workspace, name: str) -> np.ndarray:
+    with zipfile.ZipFile(job.stage("video") / "video-frames.zip") as archive:
+        return np.asarray(Image.open(archive.open(f"{name}/00001.png")))
+
+
 def test_wide_lenses_show_what_a_plain_one_shows_and_more(job: Workspace) -> None:
     """Each pixel of the plain picture is where the lens formula of the wide one has its ray."""
     plain = _pictures(job, render_width=48, render_height=48)
