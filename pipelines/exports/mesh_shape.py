@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from pipelines.errors import ExportError, ToolError
 from pipelines.exports.chosen_crop import chosen_crop
 from pipelines.exports.crop import Crop, cropped, empty_crop, narrowed, surface_in
@@ -39,12 +41,13 @@ from pipelines.exports.surface.shells import (
     find_shells,
     fuse_shells,
 )
+from pipelines.exports.surface.unblocking import unblocked
 from pipelines.exports.surface.views import known_depths, render_views
 from pipelines.exports.surface.watertight import is_closed, made_watertight, why_open
 from pipelines.exports.void import void_of_photos
 from pipelines.nerf.stereo.views import StereoView
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
-from pipelines.scene.depth_views import Floats, Pinhole, ViewStore
+from pipelines.scene.depth_views import DepthView, Floats, Pinhole, ViewStore
 from pipelines.scene.known_depths import KnownDepths
 from pipelines.scene.stereo_views import ColorView, color_view, stereo_view, view_of
 from pipelines.scene.trained_scene import TrainedScene
@@ -54,6 +57,7 @@ REDUCE_SHARE = 0.86
 """Of the export's progress, when the shape is done."""
 _RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
 _MEND_SHARE, _CLOSED_SHARE, _REFINE_SHARE = 0.78, 0.79, 0.83
+_OTHERS_PX = 64
 _View = TypeVar("_View", StereoView, ColorView)
 _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 """Photos that refine the mesh are so long, or shorter where all of them would have more pixels."""
@@ -164,10 +168,25 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
         told = ctx.told_part("closing holes", _MEND_SHARE, _CLOSED_SHARE)
         limits = hole_limits(shells, options.close_holes, options.max_distance)
         closing = close_holes(mesh, limits, store, told)
-    mesh = _out_of_the_void(closing.mesh, scene, ctx)
+        mesh = unblocked(closing.mesh, [store, _others(scene, plan, ctx)], ctx.check_cancelled)
+    mesh = _out_of_the_void(mesh, scene, ctx)
     if options.refine == "photos":
         mesh = _on_the_edges(mesh, scene, ctx)
     return Surface(mesh, shells, method, coarser, closing.as_dict())
+
+
+def _others(scene: TrainedScene, plan: Plan, ctx: StageContext) -> list[DepthView]:
+    """What the scene shows, small, from where photos were taken that do not make the surface: where
+    a camera was is nothing, whether its photo was held out or not.
+    """
+    fused = {image.file for image in plan.images}
+    views = []
+    for image in scene.cameras.images:
+        if image.file not in fused:
+            ctx.check_cancelled()
+            lens = Pinhole.of(scene.lens_of(image), _OTHERS_PX)
+            views.append(scene.depth_view(lens, np.asarray(image.world_from_camera, np.float64)))
+    return views
 
 
 def _fused(

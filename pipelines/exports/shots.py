@@ -169,6 +169,10 @@ class MixedStudio:
         self._field_px = field_px
         self.has_mesh = mesh is not None
 
+    def rendered_at(self, field_px: int) -> MixedStudio:
+        """The same with the scene at another size."""
+        return MixedStudio(self._scene, self._mesh, field_px)
+
     def picture(
         self, lens: Pinhole | Intrinsics, pose: Floats, circle: NDArray[np.bool_] | None = None
     ) -> Bytes:

@@ -1,7 +1,8 @@
 """The point cloud: points with colour and normals from the depth of training views.
 
-Points near the job's mesh are laid on it, as all views and the photos have made that; where it has
-nothing they stay where their view has them. In one frame, the world of cameras.json unless another
+Points near the job's mesh are laid on it, as all views and the photos have made that, and wear its
+picture; where views left gaps on it they are filled; where it has nothing points stay where their
+view has them. In one frame, the world of cameras.json unless another
 is asked for, in the formats asked for. Normals point to the cameras that saw the points. Views are
 spread over the capture and just large enough for the points wanted, so the work is known beforehand
 and an empty crop ends in an error instead of a search without end.
@@ -23,8 +24,11 @@ from pipelines.exports.options import CropOptions, reach_of
 from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from pipelines.exports.placement import Placement
     from pipelines.exports.surface.cloud import Cloud
+    from pipelines.exports.surface.skin import Skin
     from pipelines.scene.cameras_file import CamerasFile
     from pipelines.scene.trained_scene import TrainedScene
 
@@ -68,7 +72,8 @@ class PointcloudOptions(CropOptions):
     remove_outliers: bool = Field(True, description="Drop points far from their neighbours.")
     snap_to_mesh: bool = Field(
         True,
-        description="Lay points within two voxels of the job's mesh on it, with its normals.",
+        description="Lay points within two voxels of the job's mesh on it, with its normals and "
+        "its picture's colours, and fill gaps on it.",
     )
 
     @field_validator("formats")
@@ -84,6 +89,8 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     there is none in the crop.
     """
     # Imported where it runs: the API reads this file too.
+    import numpy as np
+
     from pipelines.exports.chosen_crop import chosen_crop
     from pipelines.exports.crop import empty_crop, narrowed, surface_in
     from pipelines.exports.formats.colmap import check_lenses
@@ -122,6 +129,13 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
             ctx.logger.warning("No subject was found; the cloud is what lies within max_distance.")
         else:
             crop = thing.region
+
+    def inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether each of [P, 3] is in what was asked for."""
+        if thing is not None:
+            return thing.holds(points)
+        return np.ones(len(points), np.bool_) if crop is None else crop.contains(points)
+
     around = surface_in(crop, probes, bounds, "pointcloud")
     bounds = narrowed(bounds, crop) or bounds
     images = scene.training_images(_MAX_VIEWS)
@@ -139,10 +153,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         if surface is not None:
             told = ctx.told_part("laying points on the mesh", _RENDER_SHARE, 0.8)
             cloud = snapped(cloud, surface, told)
-        if thing is not None:
-            cloud = cloud.take(thing.holds(cloud.points))
-        elif crop is not None:
-            cloud = cloud.take(crop.contains(cloud.points))
+        cloud = cloud.take(inside(cloud.points))
         ctx.progress(0.8, f"checking {len(cloud)} points against all views")
         cloud = cloud.take(consistent(cloud.points, store))
     if options.remove_outliers:
@@ -156,11 +167,23 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         raise empty_crop(crop, around, "pointcloud")
     if len(cloud) == 0:
         raise _empty("no surface lies within max_distance that views agree on")
+    skin = _skin(ctx) if options.snap_to_mesh else None
+    num_seen = len(cloud)
+    if skin is not None:
+        ctx.progress(0.9, "filling gaps on the mesh")
+        eyes = np.asarray([image.world_from_camera for image in images], np.float64)[:, :, 3]
+        filling = skin.filling(cloud, eyes, options.num_points, ctx.seed)
+        filling = filling.take(bounds.contains(filling.points) & inside(filling.points))
+        cloud = clouds.joined([cloud, filling])
+    filled_share = 1.0 - num_seen / len(cloud)
     if options.spacing:
         cloud = cloud.take(one_of_each_cube(cloud.points, options.spacing))
     cloud = cloud.take(least_crowded(cloud.points, options.num_points, ctx.seed))
-    num_on_mesh = int(cloud.normals.any(axis=1).sum())
-    told = ctx.told_part("estimating normals", 0.92, 0.97)
+    on_mesh = np.asarray(cloud.normals.any(axis=1))
+    if skin is not None:
+        told = ctx.told_part("painting points on the mesh", 0.92, 0.94)
+        cloud = skin.painted(cloud, on_mesh, told)
+    told = ctx.told_part("estimating normals", 0.94, 0.97)
     cloud = clouds.with_normals(cloud, _NORMAL_NEIGHBOURS, told)
     ctx.progress(0.97, "writing")
     _write(cloud, options, ctx, place, scene.cameras)
@@ -168,12 +191,25 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         "frame": place.as_dict(),
         "formats": list(options.formats),
         "num_points": len(cloud),
-        "num_on_mesh": num_on_mesh,
+        "num_on_mesh": int(on_mesh.sum()),
+        "filled_share": round(filled_share, 4),
         "num_views": len(images),
         "subject": subject,
         "crop": told_crop,
         "bounds": bounds.as_dict(),
     }
+
+
+def _skin(ctx: StageContext) -> Skin | None:
+    """The job's mesh with the picture on it; None without one."""
+    from pipelines.exports.formats.glb import read_mesh
+    from pipelines.exports.judged import mesh_of
+    from pipelines.exports.mesh import TexturedMesh
+    from pipelines.exports.surface.skin import Skin
+
+    path = mesh_of(ctx.workspace.stage("mesh"))
+    mesh = read_mesh(path) if path.is_file() else None
+    return Skin(mesh) if isinstance(mesh, TexturedMesh) and len(mesh.faces) else None
 
 
 def _write(
@@ -216,7 +252,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=10,
+    version=11,
     reads=("ingest", "depth", "mesh"),
     run=run,
     options=PointcloudOptions,

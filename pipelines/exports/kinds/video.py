@@ -102,7 +102,10 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
     )
     long_side = min(_PREVIEW_ENLARGEMENT * max(lens.size), max(own.width, own.height, *lens.size))
     shown, pose = Pinhole.of(shown.intrinsics(), long_side), flight.poses[moment]
-    picture = scene.picture(shown, pose) if studio is None else studio.picture(shown, pose)
+    if studio is None:
+        picture = scene.picture(shown, pose)
+    else:
+        picture = studio.rendered_at(scene.trained_long_side_px).picture(shown, pose)
     Image.fromarray(picture).save(ctx.out / "preview.jpg", quality=_PREVIEW_QUALITY)
     with_mesh = studio is not None and studio.has_mesh
     return {**film.told(len(flight), lens, ctx.out), "mesh_detail": with_mesh}

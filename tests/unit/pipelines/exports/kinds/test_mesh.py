@@ -25,6 +25,7 @@ from pipelines.judging.asset_views import Texture
 from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
 from pipelines.scene import gaze
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.workspace import Workspace
 from tests.gltf_validator import problems_of
 from tests.unit.pipelines.stages import tiny_job
@@ -415,3 +416,23 @@ def test_a_subject_to_be_printed_is_watertight_and_others_are_told_not_to_be(
         found = tiny_job.run(job, "mesh", watertight=True, **wanted)["summary"]
     assert found["watertight"] is False
     assert "The mesh is not watertight" in caplog.text
+
+
+def test_where_a_camera_was_is_nothing_whether_its_photo_was_held_out_or_not(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asked from a third of the photos, and from the others' places."""
+    places: list[list[np.ndarray]] = []
+
+    def record(mesh: Any, views: Any, poll: Any) -> Any:
+        places.append([view.world_from_camera[:3, 3] for part in views for view in part])
+        assert all((view.z_depth > 0.0).mean() > 0.2 for part in views for view in part)
+        return mesh
+
+    monkeypatch.setattr(mesh_shape, "unblocked", record)
+    tiny_job.run(job, "mesh", num_views=8, formats=("ply",), texture="none")
+    cameras = CamerasFile.load(job.stage("train") / "cameras.json")
+    eyes = np.asarray([image.world_from_camera for image in cameras.images])[:, :3, 3]
+    assert len(eyes) == tiny_job.NUM_IMAGES
+    (asked,) = places
+    np.testing.assert_allclose(np.sort(np.asarray(asked), axis=0), np.sort(eyes, axis=0), atol=1e-6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from scipy.spatial import cKDTree
 from pipelines.errors import ExportError
 from pipelines.exports import subject
 from pipelines.exports.crop import crop_of
-from pipelines.exports.formats.glb import read_mesh
+from pipelines.exports.formats.glb import read_mesh, write_mesh
 from pipelines.exports.formats.ply import read_ply
+from pipelines.exports.mesh import TexturedMesh
 from pipelines.exports.options import CropShapeOptions
 from pipelines.exports.surface.surface_file import load_surface
 from pipelines.registry import get_stage
@@ -112,6 +114,29 @@ def test_without_a_mesh_points_stay_where_views_have_them(job: Workspace) -> Non
     tiny_job.run(job, "mesh", texture="none")
     tiny_job.run(job, "pointcloud", snap_to_mesh=False)
     assert (job.stage("pointcloud") / "pointcloud.ply").read_bytes() == alone
+
+
+def test_points_on_the_mesh_wear_its_picture_and_its_gaps_are_filled(job: Workspace) -> None:
+    tiny_job.run(job, "mesh", formats=("glb",))
+    path = job.stage("mesh") / "mesh.glb"
+    mesh = read_mesh(path)
+    assert isinstance(mesh, TexturedMesh)
+    blue = np.zeros_like(mesh.texture)
+    blue[..., 2] = 255
+    write_mesh(path, replace(mesh, texture=blue))
+    # So many points that there are places of the mesh which no view's pixel is near.
+    summary = tiny_job.run(job, "pointcloud", num_points=20_000)["summary"]
+    colors = read_ply(job.stage("pointcloud") / "pointcloud.ply").colors
+    assert colors is not None
+    is_blue = np.abs(colors.astype(int) - [0, 0, 255]).max(axis=1) <= 3
+    assert is_blue.sum() <= summary["num_on_mesh"]
+    assert is_blue.sum() > 0.8 * summary["num_on_mesh"]
+    assert summary["filled_share"] > 0.0
+    own = tiny_job.run(job, "pointcloud", num_points=20_000, snap_to_mesh=False)["summary"]
+    assert own["filled_share"] == 0.0
+    colors = read_ply(job.stage("pointcloud") / "pointcloud.ply").colors
+    assert colors is not None
+    assert (np.abs(colors.astype(int) - [0, 0, 255]).max(axis=1) > 3).all()
 
 
 def _apart(points: NDArray[np.float32], least: float) -> float:
