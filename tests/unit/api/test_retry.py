@@ -19,7 +19,7 @@ from tests.unit.api.conftest import LEASE_S, Service, finish_job, run_stage
 
 ERROR = {"code": "tool_failed", "message": "It broke.", "hint": "Mend it."}
 RETRIED = ("job.queued", "retry")
-BEHIND_MESH = {"mesh", "pointcloud", "assess", "report"}
+BEHIND_MESH = {"mesh", "pointcloud", "video", "assess", "report"}
 
 
 def states(job: dict[str, Any]) -> dict[str, str]:

@@ -17,6 +17,7 @@ OF_THE_WHOLE_PRODUCT = (
     "api_process.py",
     "browser.py",
     "delivered.py",
+    "film.py",
     "geometry.py",
     "geometry_pictures.py",
     "geometry_truth.py",

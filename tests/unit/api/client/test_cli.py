@@ -176,7 +176,7 @@ def test_retry_says_what_runs_again_and_events_say_who_did_what(
     assert cli.main(["retry", job]) == 1
     assert "nothing to do again" in capsys.readouterr().err
     assert cli.main(["retry", job, "--from", "assess", "--set", "mesh.max_faces=4000"]) == 0
-    assert "runs again: mesh, pointcloud, assess, report" in capsys.readouterr().out
+    assert "runs again: mesh, pointcloud, video, assess, report" in capsys.readouterr().out
     assert cli.main(["events"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "job.queued  api-key:" in lines[0]
