@@ -70,7 +70,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=26,
+    version=27,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

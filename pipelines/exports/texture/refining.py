@@ -25,6 +25,7 @@ vertices.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -58,6 +59,8 @@ _SIDE = 960
 """Of the photos as they are looked at, px at most."""
 _PIXELS = 16_000_000
 """Looked at in all, at some 40 bytes each; of more an even choice."""
+_GOLDEN = 0.618
+"""Of the pixels left out between two, about so far the next row's lie aside."""
 _CHUNK = 2_000_000
 _SPREAD_PASSES = 2
 _ROWS = 256
@@ -241,9 +244,7 @@ def _looks(
         glance, share = photos.glance(index, _SIDE)
         width, height = glance.size
         kept, distance, face, weights = _met(surface, photos, index, (width, height))
-        chosen = np.zeros(len(kept), np.bool_)
-        chosen[index % stride :: stride] = True
-        kept &= chosen
+        kept &= _even_choice(width, height, stride, index)
         if kept.any():
             rows, columns = np.divmod(np.flatnonzero(kept), width)
             pixels = (np.stack([columns, rows], axis=1) + 0.5) / share
@@ -298,6 +299,17 @@ def _of_corners(vertices: NDArray[np.int32], weights: Floats, num_vertices: int)
     ends = np.arange(0, 3 * len(vertices) + 1, 3, dtype=np.int32)
     values = weights.astype(np.float32).reshape(-1)
     return csr_array((values, vertices.reshape(-1), ends), shape=(len(vertices), num_vertices))
+
+
+def _even_choice(width: int, height: int, stride: int, first: int) -> NDArray[np.bool_]:
+    """[H * W], one pixel of so many, along rows and columns alike: were they one below the other in
+    every row, as each third of 960 is, a texture would be moved in stripes.
+    """
+    rows, columns = np.arange(height)[:, None], np.arange(width)
+    aside = range(max(round(_GOLDEN * stride), 1), stride + 1)
+    step = next(step for step in aside if math.gcd(step, stride) == 1)
+    chosen: NDArray[np.bool_] = (columns + step * rows + first) % stride == 0
+    return chosen.ravel()
 
 
 def _met(

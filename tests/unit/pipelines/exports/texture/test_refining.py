@@ -196,6 +196,18 @@ def test_of_too_many_pixels_an_even_choice_is_looked_at(
     assert counts[1] == pytest.approx(counts[0] / 4, rel=0.05)
 
 
+@pytest.mark.parametrize("stride", [1, 2, 3, 4, 5, 7])
+def test_an_even_choice_leaves_no_column_and_no_row_out(stride: int) -> None:
+    """960 is a multiple of 2, 3, 4 and 5: one of so many in a row would be one below the other."""
+    for first in range(stride):
+        chosen = refining._even_choice(960, 720, stride, first).reshape(720, 960)
+        assert chosen.any(axis=0).all()
+        assert chosen.any(axis=1).all()
+        assert chosen.mean() == pytest.approx(1.0 / stride, rel=0.01)
+    together = [refining._even_choice(960, 720, stride, first) for first in range(stride)]
+    assert (np.sum(together, axis=0) == 1).all(), "each photo another part"
+
+
 def test_it_is_heard_of_and_can_be_stopped(tmp_path: Path) -> None:
     images = painted_ball.write_photos(tmp_path, painted_ball.all_round())
     photos = painted_ball.photos_of(tmp_path, images)
