@@ -2,10 +2,10 @@
 
 Points near the job's mesh are laid on it, as all views and the photos have made that, and wear its
 picture; where views left gaps on it they are filled; where it has nothing points stay where their
-view has them. In one frame, the world of cameras.json unless another
-is asked for, in the formats asked for. Normals point to the cameras that saw the points. Views are
-spread over the capture and just large enough for the points wanted, so the work is known beforehand
-and an empty crop ends in an error instead of a search without end.
+view has them. In one frame, the world of cameras.json unless another is asked for, in the formats
+asked for. Normals point to the cameras that saw the points. Views are spread over the capture and
+just large enough for the points wanted, so the work is known beforehand and an empty crop ends in
+an error instead of a search without end.
 """
 
 from __future__ import annotations

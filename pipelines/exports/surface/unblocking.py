@@ -1,8 +1,8 @@
 """A mesh without what stands right before a camera that saw far beyond it.
 
 Who films stands in empty space. Surfaces that are closed where nothing was seen, and ghosts of a
-few views, know nothing of that: one camera in thirty was found behind a sheet of some triangles, a
-hundredth of its depth away, which hides all that it saw.
+few views, know nothing of that: a camera was found in each of three captures of 28 behind a sheet
+of some triangles, a hundredth of its depth away, which hides all that it saw.
 """
 
 from __future__ import annotations
