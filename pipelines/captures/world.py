@@ -26,7 +26,7 @@ _CLEARLY = 0.8
 """Cosine up to which an axis of the world is the vertical, and nothing else is."""
 _SIDEWAYS = 0.7
 """Mean height of the cameras' X axes above which pictures may be upright ones stored sideways."""
-_LEANS = {"measured": 0.94, "vertical": 0.94, "camera_up": 0.5}
+_LEANS = {"measured": 0.94, "vertical": 0.94, "sideways": 0.94, "camera_up": 0.5}
 """Cosine between +Z and the vertical, by how that was found, below which a world without a known
 one is turned. A world that stands already, as one that we wrote, stays as it is."""
 _FAR = 100.0

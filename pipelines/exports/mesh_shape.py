@@ -56,8 +56,12 @@ from pipelines.stage import StageContext
 REDUCE_SHARE = 0.86
 """Of the export's progress, when the shape is done."""
 _RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
-_MEND_SHARE, _CLOSED_SHARE, _REFINE_SHARE = 0.78, 0.79, 0.83
+_MEND_SHARE, _CLOSED_SHARE, _OTHERS_SHARE = 0.78, 0.79, 0.793
+_FREE_SHARE, _CARVED_SHARE, _REFINE_SHARE = 0.797, 0.8, 0.83
+_CLEARING = "clearing what is empty"
 _OTHERS_PX = 64
+_MOST_CARVING = 400
+"""Photos that tell what is empty: more tell no more, and their maps are held at once."""
 _View = TypeVar("_View", StereoView, ColorView)
 _PHOTO_SIDE_PX, _PHOTOS_PX = 960, 50_000_000
 """Photos that refine the mesh are so long, or shorter where all of them would have more pixels."""
@@ -168,7 +172,9 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
         told = ctx.told_part("closing holes", _MEND_SHARE, _CLOSED_SHARE)
         limits = hole_limits(shells, options.close_holes, options.max_distance)
         closing = close_holes(mesh, limits, store, told)
-        mesh = unblocked(closing.mesh, [store, _others(scene, plan, ctx)], ctx.check_cancelled)
+        others = _others(scene, plan, ctx)
+        told = ctx.told_part(_CLEARING, _OTHERS_SHARE, _FREE_SHARE)
+        mesh = unblocked(closing.mesh, [store, others], told)
     mesh = _out_of_the_void(mesh, scene, ctx)
     if options.refine == "photos":
         mesh = _on_the_edges(mesh, scene, ctx)
@@ -180,12 +186,13 @@ def _others(scene: TrainedScene, plan: Plan, ctx: StageContext) -> list[DepthVie
     a camera was is nothing, whether its photo was held out or not.
     """
     fused = {image.file for image in plan.images}
+    others = [image for image in scene.cameras.images if image.file not in fused]
+    told = ctx.told_part(_CLEARING, _CLOSED_SHARE, _OTHERS_SHARE)
     views = []
-    for image in scene.cameras.images:
-        if image.file not in fused:
-            ctx.check_cancelled()
-            lens = Pinhole.of(scene.lens_of(image), _OTHERS_PX)
-            views.append(scene.depth_view(lens, np.asarray(image.world_from_camera, np.float64)))
+    for done, image in enumerate(others):
+        told(done / len(others))
+        lens = Pinhole.of(scene.lens_of(image), _OTHERS_PX)
+        views.append(scene.depth_view(lens, np.asarray(image.world_from_camera, np.float64)))
     return views
 
 
@@ -231,19 +238,20 @@ def _on_the_photos(
 
 def _on_the_edges(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
     """The mesh with its outlines on the edges of the training photos."""
-    told = ctx.told_part("moving outlines", _CLOSED_SHARE, _REFINE_SHARE)
+    told = ctx.told_part("moving outlines", _CARVED_SHARE, _REFINE_SHARE)
     return outlined(mesh, _photos(color_view, scene, ctx, told), told)
 
 
 def _out_of_the_void(mesh: TriangleMesh, scene: TrainedScene, ctx: StageContext) -> TriangleMesh:
     """The mesh without what stands before the sky or the blank ground that `depth` told of."""
-    images = {image.file: image for image in scene.training_images()}
+    images = {image.file: image for image in scene.training_images(_MOST_CARVING)}
+    told = ctx.told_part(_CLEARING, _FREE_SHARE, _CARVED_SHARE)
     photos = (
         Seen(view_of(images[void.file], void.lens, void.z), void.is_void, void.z)
         for void in void_of_photos(ctx.workspace)
         if void.file in images
     )
-    return carved(mesh, photos, ctx.check_cancelled)
+    return carved(mesh, photos, told)
 
 
 def _photos(

@@ -28,26 +28,50 @@ _AROUND = (0.054, 0.242, 0.408, 0.242, 0.054)
 """A Gaussian of one pixel, its sum 1: two edges that almost meet are no disagreement."""
 
 
-def mixed(field: Floats, mesh: AssetView) -> NDArray[np.float32]:
+def mixed(field: Floats, mesh: AssetView, *, around: bool = False) -> NDArray[np.float32]:
     """The picture [H, W, 3] of both, sRGB in [0, 1].
 
-    field: [h, w, 3], the trained scene's, of the same view and no larger. mesh: [H, W].
+    field: [h, w, 3], the trained scene's, of the same view and no larger. mesh: [H, W]. around:
+    whether its left border goes on at the right, as an equirectangular picture's does; then w and W
+    are even.
     """
     size, small = mesh.hit.shape, field.shape[:2]
-    trained = _channels(field)
+    trained, hit, color = _channels(field), torch.from_numpy(mesh.hit), _channels(mesh.color)
+    if around:
+        size, small = (size[0], 2 * size[1]), (small[0], 2 * small[1])
+        trained, hit, color = _wrapped(trained), _wrapped(hit), _wrapped(color)
     scene = interpolate(trained, size, mode="bicubic", align_corners=False)
-    both = torch.where(torch.from_numpy(mesh.hit), _channels(mesh.color), scene)
+    both = torch.where(hit, color, scene)
     shrunk = interpolate(both, small, mode="area")
     apart = _smooth((shrunk - trained).abs().amax(dim=1, keepdim=True))
     share = _MESH_SHARE * torch.exp(-((apart / _DIFFERENT) ** 2))
     share = interpolate(share, size, mode="bilinear", align_corners=False)
-    return _picture(torch.lerp(scene, both, share))
+    result = torch.lerp(scene, both, share)
+    return _picture(_unwrapped(result) if around else result)
 
 
-def enlarged(field: Floats, height: int, width: int) -> NDArray[np.float32]:
-    """The trained scene's picture alone at a larger size."""
-    size = (height, width)
-    return _picture(interpolate(_channels(field), size, mode="bicubic", align_corners=False))
+def enlarged(
+    field: Floats, height: int, width: int, *, around: bool = False
+) -> NDArray[np.float32]:
+    """The trained scene's picture alone at a larger size. around: as for `mixed`."""
+    if not around:
+        shown = interpolate(_channels(field), (height, width), mode="bicubic", align_corners=False)
+        return _picture(shown)
+    wrapped = _wrapped(_channels(field))
+    shown = interpolate(wrapped, (height, 2 * width), mode="bicubic", align_corners=False)
+    return _picture(_unwrapped(shown))
+
+
+def _wrapped(values: Tensor) -> Tensor:
+    """[..., W] as [..., 2 W]: with the other half beyond each border."""
+    half = values.shape[-1] // 2
+    return torch.cat([values[..., half:], values, values[..., :half]], dim=-1)
+
+
+def _unwrapped(values: Tensor) -> Tensor:
+    """[..., 2 W] as [..., W]: what lies between."""
+    quarter = values.shape[-1] // 4
+    return values[..., quarter : 3 * quarter]
 
 
 def _channels(picture: Floats) -> Tensor:

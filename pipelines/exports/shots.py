@@ -160,31 +160,45 @@ class MixedStudio:
     """A trained scene and its mesh, to be filmed as one (`pipelines.exports.mixing`).
 
     mesh: None for a scene that has none; then what was trained on is enlarged. field_px: long side
-        at which the scene is rendered; the mesh is at the film's.
+        at which the scene is rendered through a perspective lens; the mesh is at the film's.
+    own: the capture's typical lens. Through a wide one the scene has as many pixels for an angle as
+        this has at that size.
     """
 
-    def __init__(self, scene: TrainedScene, mesh: MeshStudio | None, field_px: int) -> None:
+    def __init__(
+        self, scene: TrainedScene, mesh: MeshStudio | None, field_px: int, own: Intrinsics
+    ) -> None:
         self._scene = scene
         self._mesh = mesh
         self._field_px = field_px
+        self._own = own
         self.has_mesh = mesh is not None
 
     def rendered_at(self, field_px: int) -> MixedStudio:
         """The same with the scene at another size."""
-        return MixedStudio(self._scene, self._mesh, field_px)
+        return MixedStudio(self._scene, self._mesh, field_px, self._own)
 
     def picture(
         self, lens: Pinhole | Intrinsics, pose: Floats, circle: NDArray[np.bool_] | None = None
     ) -> Bytes:
         """[H, W, 3]: both."""
         full = intrinsics_of(lens)
-        long_side = min(self._field_px, max(full.width, full.height))
-        field = as_array(self._scene.render(full, pose, long_side).rgb)
+        around = full.model == "EQUIRECTANGULAR"
+        field = as_array(self._scene.render(full, pose, self._long_side(lens)).rgb)
         if self._mesh is None:
-            shown = enlarged(field, full.height, full.width)
+            shown = enlarged(field, full.height, full.width, around=around)
         else:
-            shown = mixed(field, self._mesh.view(full, pose))
+            shown = mixed(field, self._mesh.view(full, pose), around=around)
         return within(circle, as_uint8(shown))
+
+    def _long_side(self, lens: Pinhole | Intrinsics) -> int:
+        """At which the scene is rendered, px."""
+        most = max(lens.width, lens.height)
+        if isinstance(lens, Pinhole):
+            return min(self._field_px, most)
+        per_radian = self._own.fl_x * self._field_px / max(self._own.width, self._own.height)
+        wanted = 4 * math.ceil(most * _angle_of(lens) * per_radian / 4.0)
+        return min(wanted, most)
 
 
 def intrinsics_of(lens: Pinhole | Intrinsics) -> Intrinsics:

@@ -9,6 +9,9 @@ it is tipped up or down. The direction most orthogonal to all X axes is therefor
 where every camera looks down. That is nerfstudio's `vertical` (cameras/camera_utils.py,
 auto_orient_and_center_poses), here with weights that make a few rolled cameras harmless.
 
+Photos that have lost their EXIF lie on their side as the sensor stored them. Then their Y axes are
+level and the X axes are not, and one end of these is up: `sideways`.
+
 X axes that are all parallel say nothing: pictures of a floor, taken straight down one beside the
 other, are those of a wall. There only what the devices measured tells, which is asked first.
 """
@@ -31,6 +34,13 @@ _FEWEST_MEASURED, _LEAST_MEASURED = 3, 0.25
 """Cameras that must have measured which way is up, at least, and their share."""
 _SAME_UP_DEG, _MOST_SAME = 10.0, 0.75
 """How near one another measured directions are that are the same, and how many of them must be."""
+_NOT_LEVEL = 0.12
+"""Mean of |sine| of the X axes' heights, above which a phone was not held upright (7 degrees);
+people's hands have some 0.05."""
+_CLEARLY_LEVEL = 0.5
+"""Of that, what the Y axes of pictures on their side have at most."""
+_ALL_ROUND_DEG = 200.0
+"""Where X axes are parallel: so much of a circle no upright camera is tipped through."""
 _MANY_UPSIDE_DOWN = 0.25
 """Share of cameras, their X axes parallel, that are upside down against the others where a drone
 flies to and fro; fewer are pictures of a wall that lost how they were held."""
@@ -63,7 +73,8 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """How the world was turned and centred. up_from: measured, vertical, camera_up or none.
+    """How the world was turned and centred. up_from: measured, vertical, sideways, camera_up or
+    none.
 
     centered_on: focus (the point that the cameras look at) or centers (their mean).
     """
@@ -82,8 +93,8 @@ def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
 def find_up(
     world_from_camera: Array, measured: Sequence[Sequence[float] | None] = ()
 ) -> tuple[Array, str]:
-    """The direction away from gravity, [3] unit, and how it was found: measured, vertical or
-    camera_up.
+    """The direction away from gravity, [3] unit, and how it was found: measured, vertical,
+    sideways or camera_up.
 
     measured: N, that direction [3] in each camera's axes where its device told it; or none at all.
     Raises ValueError where there are no cameras.
@@ -92,12 +103,13 @@ def find_up(
         raise ValueError("no cameras to find the vertical from")
     if (told := _agreed(world_from_camera, measured)) is not None:
         return told, "measured"
+    if (beside := _up_of_pictures_on_their_side(world_from_camera)) is not None:
+        return beside, "sideways"
     x_axes = world_from_camera[:, :, 0]
     mean_up: Array = world_from_camera[:, :, 1].mean(axis=0)
-    _, singular, rows = np.linalg.svd(x_axes, full_matrices=True)
-    if len(x_axes) >= 2 and singular[1] >= _MIN_TURN * np.sqrt(len(x_axes)):
-        up = _most_orthogonal(x_axes, rows[2])
+    if (up := _level_to(x_axes)) is not None:
         return up * _sign_of_up(up, world_from_camera), "vertical"
+    _, _, rows = np.linalg.svd(x_axes, full_matrices=True)
     level = mean_up - rows[0] * float(mean_up @ rows[0])
     if _share_upside_down(world_from_camera[:, :, 1]) >= _MANY_UPSIDE_DOWN:
         level = world_from_camera[:, :, 2].mean(axis=0)  # nobody takes a wall so: all look down
@@ -105,6 +117,46 @@ def find_up(
     if length < _MIN_SIGN:
         return np.array([0.0, 0.0, 1.0]), "camera_up"
     return level / length, "camera_up"
+
+
+def _up_of_pictures_on_their_side(world_from_camera: Array) -> Array | None:
+    """The direction, [3] unit, where the cameras' Y axes are level and their X axes are not; None
+    where that is not clear.
+
+    Its end is the one from which they look down, or else the pictures' left, as photos are stored
+    of a phone that is held upright.
+    """
+    x_axes, y_axes = world_from_camera[:, :, 0], world_from_camera[:, :, 1]
+    up, other = _level_to(y_axes), _level_to(x_axes)
+    if up is None:
+        return None
+    if other is None:
+        if _turned_through_deg(y_axes) < _ALL_ROUND_DEG:
+            return None
+    else:
+        off = float(np.abs(x_axes @ other).mean())
+        if off < _NOT_LEVEL or float(np.abs(y_axes @ up).mean()) > _CLEARLY_LEVEL * off:
+            return None
+    backwards = float(world_from_camera[:, :, 2].mean(axis=0) @ up)
+    end = backwards if abs(backwards) >= _MIN_SIGN else -float(x_axes.mean(axis=0) @ up)
+    return up if end >= 0.0 else -up
+
+
+def _level_to(axes: Array) -> Array | None:
+    """The direction [3] that axes [N, 3] are most orthogonal to; None where they are parallel."""
+    _, singular, rows = np.linalg.svd(axes, full_matrices=True)
+    if len(axes) < 2 or singular[1] < _MIN_TURN * np.sqrt(len(axes)):
+        return None
+    return _most_orthogonal(axes, rows[2])
+
+
+def _turned_through_deg(axes: Array) -> float:
+    """How much of a circle directions [N, 3] in a plane have gone through: all but the widest
+    gap."""
+    _, _, rows = np.linalg.svd(axes, full_matrices=False)
+    angles = np.sort(np.degrees(np.arctan2(axes @ rows[1], axes @ rows[0])))
+    gaps = np.diff(angles, append=angles[0] + 360.0)
+    return 360.0 - float(gaps.max())
 
 
 def _share_upside_down(y_axes: Array) -> float:

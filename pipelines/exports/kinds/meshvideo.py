@@ -53,7 +53,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     from pipelines.exports.filming import Film, make_film
     from pipelines.exports.formats.glb import read_mesh
     from pipelines.exports.judged import mesh_of
-    from pipelines.exports.paths.flight import make_path, typical_lens
+    from pipelines.exports.paths.flight import held_upright, make_path, typical_lens
     from pipelines.exports.shots import Lens, MeshStudio
 
     path = mesh_of(ctx.workspace.stage("mesh"))
@@ -65,8 +65,8 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
         )
     ctx.progress(0.0, "reading the mesh")
     studio = MeshStudio(read_mesh(path))
-    images = scene.cameras.images
-    own = typical_lens([scene.lens_of(image) for image in images])
+    lenses = [scene.lens_of(image) for image in scene.cameras.images]
+    images, own = held_upright(scene.cameras.images, typical_lens(lenses))
     flight = make_path(options, images, options.frames())
     lens = Lens(options, own, flight)
     film = Film(

@@ -172,8 +172,14 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     if skin is not None:
         ctx.progress(0.9, "filling gaps on the mesh")
         eyes = np.asarray([image.world_from_camera for image in images], np.float64)[:, :, 3]
-        filling = skin.filling(cloud, eyes, options.num_points, ctx.seed)
-        filling = filling.take(bounds.contains(filling.points) & inside(filling.points))
+        filling = skin.filling(
+            cloud,
+            eyes,
+            options.num_points,
+            ctx.seed,
+            lambda points: bounds.contains(points) & inside(points),
+            ctx.check_cancelled,
+        )
         cloud = clouds.joined([cloud, filling])
     filled_share = 1.0 - num_seen / len(cloud)
     if options.spacing:
@@ -252,7 +258,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=11,
+    version=12,
     reads=("ingest", "depth", "mesh"),
     run=run,
     options=PointcloudOptions,

@@ -19,6 +19,7 @@ from pipelines.stage import Artifact, StageContext
 
 if TYPE_CHECKING:
     from pipelines.exports.shots import MixedStudio
+    from pipelines.scene.cameras_file import Intrinsics
     from pipelines.scene.trained_scene import TrainedScene
 
 Output = Literal["rgb", "depth", "normals", "accumulation"]
@@ -54,7 +55,8 @@ class VideoOptions(FlightOptions):
         ge=16,
         le=MAX_SIDE_PX,
         description="With the mesh: long side at which the trained scene is rendered, no larger "
-        "than the video's; null for that of the pictures that it was trained on.",
+        "than the video's; null for that of the pictures that it was trained on. Through a fisheye "
+        "or all round it has as many pixels for each degree as a picture of the capture so large.",
     )
 
     @field_validator("outputs")
@@ -73,12 +75,17 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
     from PIL import Image
 
     from pipelines.exports.filming import Film, make_film
-    from pipelines.exports.paths.flight import make_path, preview_index, typical_lens
+    from pipelines.exports.paths.flight import (
+        held_upright,
+        make_path,
+        preview_index,
+        typical_lens,
+    )
     from pipelines.exports.shots import Lens
     from pipelines.scene.depth_views import Pinhole
 
-    images = scene.cameras.images
-    own = typical_lens([scene.lens_of(image) for image in images])
+    lenses = [scene.lens_of(image) for image in scene.cameras.images]
+    images, own = held_upright(scene.cameras.images, typical_lens(lenses))
     flight = make_path(options, images, options.frames())
     lens = Lens(options, own, flight)
     together = options.layout == "side_by_side"
@@ -90,8 +97,8 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
         pictures="video-frames.zip",
         together=together,
     )
-    studio = _studio(scene, options, ctx)
-    drawn = {"rgb": studio.picture} if studio is not None and "rgb" in options.outputs else {}
+    studio = _studio(scene, own, options, ctx)
+    drawn = {} if studio is None else {"rgb": studio.picture}
     make_film(scene, film, flight, lens, ctx, drawn)
     ctx.progress(len(flight) / (len(flight) + 4), "preview picture")
     moment = preview_index(flight.poses, images)
@@ -111,28 +118,30 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
     return {**film.told(len(flight), lens, ctx.out), "mesh_detail": with_mesh}
 
 
-def _studio(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> MixedStudio | None:
-    """What draws scene and mesh together; None where only the scene is asked for."""
+def _studio(
+    scene: TrainedScene, own: Intrinsics, options: VideoOptions, ctx: StageContext
+) -> MixedStudio | None:
+    """What draws scene and mesh together; None where only the scene is asked for, or no colours."""
     from pipelines.exports.formats.glb import read_mesh
     from pipelines.exports.judged import mesh_of
     from pipelines.exports.mesh import TexturedMesh
     from pipelines.exports.shots import MeshStudio, MixedStudio
 
-    if not options.mesh_detail:
+    if not options.mesh_detail or "rgb" not in options.outputs:
         return None
     trained_px, path = scene.trained_long_side_px, mesh_of(ctx.workspace.stage("mesh"))
     ctx.progress(0.0, "reading the mesh")
     mesh = read_mesh(path) if path.is_file() else None
     if not isinstance(mesh, TexturedMesh):
-        return MixedStudio(scene, None, trained_px)
-    return MixedStudio(scene, MeshStudio(mesh), options.field_px or trained_px)
+        return MixedStudio(scene, None, trained_px, own)
+    return MixedStudio(scene, MeshStudio(mesh), options.field_px or trained_px, own)
 
 
 _PLAYER = "any browser or player"
 
 EXPORT = Export(
     kind="video",
-    version=5,
+    version=6,
     reads=("mesh",),
     run=run,
     options=VideoOptions,

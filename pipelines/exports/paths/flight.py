@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STEEP = 1e-4
+_ON_THEIR_SIDE = 0.7
+"""Median height of cameras' X axes from which pictures are turned for who watches."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,38 @@ def make_path(options: PathOptions, images: Sequence[PosedImage], num_frames: in
     module_name, _, function_name = PATHS[options.path].partition(":")
     path: Callable[..., Flight] = getattr(importlib.import_module(module_name), function_name)
     return path(images, options, num_frames)
+
+
+def held_upright(
+    images: Sequence[PosedImage], lens: Intrinsics
+) -> tuple[Sequence[PosedImage], Intrinsics]:
+    """The cameras and their typical lens, turned by a quarter where photos lie on their side: as
+    apps store them of a phone that is held upright, and as they lie once EXIF is lost.
+
+    lens: without tangential distortion, as `typical_lens` gives it.
+    """
+    poses = np.asarray([image.world_from_camera for image in images], np.float64)
+    right = float(np.median(poses[:, 2, 0])) if len(poses) else 0.0
+    if abs(right) < _ON_THEIR_SIDE:
+        return images, lens
+    # The new X and Y axes in the old ones: what was at the right, or at the left, is above now.
+    turn = (
+        np.array([[0.0, 1.0], [-1.0, 0.0]]) if right > 0.0 else np.array([[0.0, -1.0], [1.0, 0.0]])
+    )
+    poses[:, :, :2] = poses[:, :, :2] @ turn
+    turned = [
+        replace(image, world_from_camera=tuple(tuple(row) for row in pose.tolist()))
+        for image, pose in zip(images, poses, strict=True)
+    ]
+    return turned, replace(
+        lens,
+        width=lens.height,
+        height=lens.width,
+        fl_x=lens.fl_y,
+        fl_y=lens.fl_x,
+        cx=lens.height / 2.0,
+        cy=lens.width / 2.0,
+    )
 
 
 def looking_at(places: Floats, target: Floats, up: Floats = _UP) -> Floats:
@@ -92,7 +126,8 @@ def lens_of_size(lens: Intrinsics, width: int, height: int) -> Pinhole:
 
 
 def typical_lens(lenses: Sequence[Intrinsics]) -> Intrinsics:
-    """The most common size, with the median focal length among its lenses, centred."""
+    """The most common size, with the median focal length among its lenses, centred and without
+    tangential distortion."""
     sizes = [(lens.width, lens.height) for lens in lenses]
     width, height = max(sizes, key=sizes.count)
     same = [lens for lens in lenses if (lens.width, lens.height) == (width, height)]
@@ -102,4 +137,6 @@ def typical_lens(lenses: Sequence[Intrinsics]) -> Intrinsics:
         fl_y=float(np.median([lens.fl_y for lens in same])),
         cx=width / 2.0,
         cy=height / 2.0,
+        p1=0.0,
+        p2=0.0,
     )

@@ -42,18 +42,19 @@ class Seen(NamedTuple):
 
 
 def carved(
-    mesh: TriangleMesh, photos: Iterable[Seen], poll: Callable[[], None] = lambda: None
+    mesh: TriangleMesh,
+    photos: Iterable[Seen],
+    on_progress: Callable[[float], None] = lambda done: None,
 ) -> TriangleMesh:
-    """The mesh without what photos see through.
-
-    poll: called for each, more than once; may raise. A mesh of which nothing would be left stays.
+    """The mesh without what photos see through. on_progress: told the share that is done; may
+    raise. A mesh of which nothing would be left stays.
     """
     sure = [
         one._replace(is_void=binary_erosion(one.is_void, iterations=_MARGIN_PX, border_value=1))
         for one in photos
     ]
-    hull = _Hull(sure, poll)
-    empty = hull.is_empty(mesh.vertices)
+    hull = _Hull(sure, on_progress)
+    empty = hull.is_empty(mesh.vertices, 0)
     if not empty.any() or empty[mesh.faces].all():
         return mesh
     return _cut(mesh, empty, hull)
@@ -64,14 +65,14 @@ class _Hull:
     """photos: void where they are so for sure."""
 
     photos: Sequence[Seen]
-    poll: Callable[[], None]
+    on_progress: Callable[[float], None]
 
-    def is_empty(self, points: Floats) -> Bools:
-        """[P], whether enough photos see through points [P, 3]."""
+    def is_empty(self, points: Floats, turn: int) -> Bools:
+        """[P], whether enough photos see through points [P, 3]. turn: how often it was asked."""
         through = np.zeros(len(points), np.int64)
         reached = np.zeros(len(points), np.int64)
-        for view, void, z in self.photos:
-            self.poll()
+        for done, (view, void, z) in enumerate(self.photos):
+            self.on_progress((turn + done / len(self.photos)) / (1 + _HALVINGS))
             which, row, column = view.shown_at(points)
             depth = (points[which] - view.center) @ view.world_from_camera[:, 2]
             known = z[row, column]
@@ -125,8 +126,8 @@ def _border(vertices: Floats, edges: NDArray[np.int32], hull: _Hull) -> Floats:
     """[E], how far along edges [E, 2] from what is there to what is empty the border lies."""
     begin, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
     low, high = np.zeros(len(edges)), np.ones(len(edges))
-    for _ in range(_HALVINGS):
+    for turn in range(1, 1 + _HALVINGS):
         middle = 0.5 * (low + high)
-        empty = hull.is_empty(begin + middle[:, None] * (end - begin))
+        empty = hull.is_empty(begin + middle[:, None] * (end - begin), turn)
         low, high = np.where(empty, low, middle), np.where(empty, middle, high)
     return 0.5 * (low + high)

@@ -34,6 +34,10 @@ _PIXEL = 0.7
 """Of a point's spacing: what its colour is the mean of."""
 _AWAY = 2.0
 """Of a point's spacing: so far a mesh with fewer triangles may pass it by."""
+_MOST_EYES, _MOST_ASKED = 64, 20_000
+"""Cameras that are asked what they see, points whether the mesh reaches them: more tell no more."""
+_BEFORE = 0.999
+"""Share of the way to a point that is to be free."""
 _PORTION = 250_000
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
@@ -86,18 +90,30 @@ class Skin:
             colors[some[there]] = np.rint(255.0 * shown[there])
         return replace(cloud, colors=colors)
 
-    def filling(self, cloud: Cloud, eyes: Floats, num_points: int, seed: int) -> Cloud:
+    def filling(
+        self,
+        cloud: Cloud,
+        eyes: Floats,
+        num_points: int,
+        seed: int,
+        inside: Callable[[Floats], NDArray[np.bool_]] = lambda points: np.ones(len(points), bool),
+        poll: Callable[[], None] = lambda: None,
+    ) -> Cloud:
         """Points of the mesh, not painted yet, for where a cloud of so many has none nearby.
 
-        eyes: [N, 3], the cameras. Points are as dense as pixels see them: by the distance to the
-        nearest camera.
+        eyes: [N, 3], the cameras. inside: whether the cloud is to have points [P, 3]. poll: called
+        now and then; may raise. Points are as dense as pixels see them: by the distance to the
+        nearest camera. What faces no camera, or is hidden from all, was filled by whoever closed
+        the mesh, and gets none.
         """
-        mesh, wanted = self._mesh, max(round(_FILL_SHARE * num_points), 1)
+        mesh = self._mesh
+        wanted = max(round(_FILL_SHARE * num_points * self._share_of(cloud)), 1)
         corners = mesh.vertices[mesh.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = 0.5 * np.linalg.norm(across, axis=1)
-        tree = cKDTree(eyes)
-        far, _ = tree.query(corners.mean(axis=1))
+        area = 0.5 * np.linalg.norm(across, axis=1) * inside(corners.mean(axis=1))
+        if not area.any():
+            return cloud.take(np.zeros(len(cloud), bool))
+        far, _ = cKDTree(eyes).query(corners.mean(axis=1))
         pixels = area / np.maximum(far, max(_NEAREST_EYE * float(np.median(far)), 1e-12)) ** 2
         random = np.random.default_rng(seed)
         along = np.cumsum(pixels)
@@ -113,12 +129,43 @@ class Skin:
         gap = np.full(len(points), np.inf)
         if len(cloud):
             gap, _ = cKDTree(cloud.points).query(points, workers=-1)
-        thin = gap > spacing
-        normals = self._between(mesh.normals, face[thin], shares[thin])
+        thin = (gap > spacing) & inside(points)
+        points, normals = points[thin], self._between(mesh.normals, face[thin], shares[thin])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        _, seen_by = tree.query(points[thin])
-        grey = np.full((int(thin.sum()), 3), 128, np.uint8)
-        return Cloud(points[thin], grey, eyes[seen_by], normals)
+        eye = self._seen_by(points, normals, eyes, poll)
+        shown = eye >= 0
+        grey = np.full((int(shown.sum()), 3), 128, np.uint8)
+        return Cloud(points[shown], grey, eyes[eye[shown]], normals[shown])
+
+    def _share_of(self, cloud: Cloud) -> float:
+        """Of a cloud's points on the surface that the mesh was made of, the share that the mesh
+        still has: a crop of it is not to be filled for all."""
+        which = np.flatnonzero(cloud.normals.any(axis=1))
+        which = which[:: max(len(which) // _MOST_ASKED, 1)]
+        if len(which) == 0:
+            return 1.0
+        local = cloud.points[which] - self._origin
+        found = self._scene.compute_closest_points(_core.Tensor(local.astype(np.float32)))
+        away = np.linalg.norm(found["points"].numpy() - local, axis=1)
+        return float((away <= _AWAY * point_spacing(local)).mean())
+
+    def _seen_by(
+        self, points: Floats, normals: Floats, eyes: Floats, poll: Callable[[], None]
+    ) -> NDArray[np.int64]:
+        """[P], the nearest of the cameras that points face with nothing of the mesh between; -1 for
+        none."""
+        best, nearest = np.full(len(points), -1, np.int64), np.full(len(points), np.inf)
+        for index in range(0, len(eyes), max(len(eyes) // _MOST_EYES, 1)):
+            poll()
+            way = eyes[index] - points
+            distance = np.linalg.norm(way, axis=1)
+            some = np.flatnonzero((distance < nearest) & ((way * normals).sum(axis=1) > 0.0))
+            begins = np.broadcast_to(eyes[index] - self._origin, (len(some), 3))
+            rays = np.concatenate([begins, -way[some]], axis=1).astype(np.float32)
+            hidden = self._scene.test_occlusions(_core.Tensor(rays), 0.0, _BEFORE).numpy()
+            some = some[~hidden]
+            best[some], nearest[some] = index, distance[some]
+        return best
 
     def _between(self, values: Floats, face: NDArray[np.integer[Any]], shares: Floats) -> Floats:
         """Values [V, C] of the mesh's vertices at places in faces, [P, C]."""

@@ -13,14 +13,18 @@ from typing import Any
 import numpy as np
 import open3d
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion, binary_propagation
 
 from pipelines.exports.mesh import TriangleMesh
-from pipelines.scene.depth_views import DepthView, ViewStore
+from pipelines.scene.depth_views import DepthView, Floats, ViewStore
 
 _TOO_NEAR = 0.1
 """Share of a view's depth: nothing is filmed through what stands so near."""
-_EVERY = 3
-"""Pixels along each side for a ray: what is so near is large."""
+_RAYS = 100
+"""Of a view along its long side, about: what is so near is large."""
+_WHOLE = np.ones((3, 3), np.bool_)
+"""Rays: what nowhere hides so many together is the outline of something before a far ground, which
+a mesh and a depth map never have at the same pixel."""
 _MOST_ROUNDS = 8
 """Behind one sheet there may be another."""
 
@@ -32,16 +36,18 @@ _tensor_geometry: Any = open3d.t.geometry
 def unblocked(
     mesh: TriangleMesh,
     views: Sequence[ViewStore | Sequence[DepthView]],
-    poll: Callable[[], None] = lambda: None,
+    on_progress: Callable[[float], None] = lambda done: None,
 ) -> TriangleMesh:
-    """The mesh without the faces that a ray of a view meets before a tenth of the depth that is
-    known there. views: in any number of parts. poll: called for each view, more than once; may
-    raise. A mesh of which nothing would be left stays.
+    """The mesh without the faces that rays of a view meet before a tenth of the depth that is known
+    there, where these are a patch of the picture.
+
+    views: in any number of parts. on_progress: told the share that is done; may raise. A mesh of
+    which nothing would be left stays.
     """
     faces = mesh.faces
     origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
     asked = [(part, index) for part in views for index in range(len(part))]
-    for _ in range(_MOST_ROUNDS):
+    for turn in range(_MOST_ROUNDS):
         if len(faces) == 0:
             return mesh
         scene = _tensor_geometry.RaycastingScene()
@@ -51,9 +57,9 @@ def unblocked(
         )
         blocking = np.zeros(len(faces), np.bool_)
         blocked = []
-        for part, index in asked:
-            poll()
-            found = _blocking(scene, part[index], origin)
+        for done, (part, index) in enumerate(asked):
+            on_progress((turn + done / len(asked)) / _MOST_ROUNDS)
+            found = _blocking(scene, part[index], origin, mesh.vertices, faces)
             if len(found):
                 blocking[found] = True
                 blocked.append((part, index))
@@ -63,13 +69,33 @@ def unblocked(
     return mesh if len(faces) in (0, len(mesh.faces)) else mesh.with_faces(faces)
 
 
-def _blocking(scene: Any, view: DepthView, origin: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The faces that stand before a view."""
-    known = view.z_depth[::_EVERY, ::_EVERY]
-    ways = view.lens.directions()[::_EVERY, ::_EVERY][known > 0.0]  # of z depth 1
+def _blocking(
+    scene: Any,
+    view: DepthView,
+    origin: Floats,
+    vertices: Floats,
+    faces: NDArray[np.int32],
+) -> NDArray[np.int64]:
+    """The faces that stand before a view: those that rays meet, and the smaller ones between."""
+    every = max(round(max(view.z_depth.shape) / _RAYS), 1)
+    known = view.z_depth[::every, ::every]
+    ways = view.lens.directions()[::every, ::every]  # of z depth 1
     pose = np.asarray(view.world_from_camera, np.float64)
     begins = np.broadcast_to(pose[:, 3] - origin, ways.shape)
-    rays = np.concatenate([begins, ways @ pose[:, :3].T], axis=1).astype(np.float32)
+    rays = np.concatenate([begins, ways @ pose[:, :3].T], axis=-1).astype(np.float32)
     found = scene.cast_rays(_core.Tensor(rays))
-    near = found["t_hit"].numpy() < _TOO_NEAR * known[known > 0.0]
-    return np.unique(found["primitive_ids"].numpy()[near]).astype(np.int64)
+    hides = found["t_hit"].numpy() < _TOO_NEAR * known
+    patches = binary_erosion(hides, _WHOLE, border_value=1)
+    near = binary_propagation(patches, _WHOLE, mask=hides)
+    if not near.any():
+        return np.zeros(0, np.int64)
+    x, y, back = ((vertices[faces].mean(axis=1) - pose[:, 3]) @ pose[:, :3]).T
+    z = np.where(back < 0.0, -back, np.inf)
+    lens = view.lens
+    column = np.floor((lens.cx + lens.fl_x * x / z) / every)
+    row = np.floor((lens.cy - lens.fl_y * y / z) / every)
+    shown = (column >= 0) & (column < near.shape[1]) & (row >= 0) & (row < near.shape[0])
+    which = np.flatnonzero(shown & np.isfinite(z))
+    place = row[which].astype(np.int64), column[which].astype(np.int64)
+    small = which[near[place] & (z[which] < _TOO_NEAR * known[place])]
+    return np.union1d(found["primitive_ids"].numpy()[near].astype(np.int64), small)

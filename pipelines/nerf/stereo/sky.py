@@ -284,6 +284,8 @@ class _Look:
     def _of_top(self) -> Floats:
         """[N]: what share of the picture's upper border each takes."""
         border = at_border(self.seen.there)
+        if not border.any():  # a mask may hide all of a picture
+            return np.zeros(len(self.is_bare))
         low, high = self.height[border].min(), self.height[border].max()
         top = border & (self.height >= high - 0.25 * (high - low))
         share: Floats = np.bincount(self.seen.labels[top], minlength=len(self.is_bare)) / top.sum()

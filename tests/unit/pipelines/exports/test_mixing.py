@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.exports.mixing import mixed
+from pipelines.exports.mixing import enlarged, mixed
 from pipelines.judging.asset_views import AssetView
 
 
@@ -86,3 +86,20 @@ def test_sizes_need_not_divide_and_colours_stay_colours() -> None:
     assert picture.shape == (45, 82, 3)
     assert picture.dtype == np.float32
     assert 0.0 <= picture.min() <= picture.max() <= 1.0
+
+
+def test_a_picture_all_round_has_no_seam() -> None:
+    """What a player shows where the left border meets the right one."""
+    angle = (np.arange(480) + 0.5) / 480 * 2.0 * np.pi
+    whole = np.broadcast_to(0.5 + 0.3 * np.sin(angle + 0.7)[None, :, None], (240, 480, 3))
+    field = whole.reshape(24, 10, 48, 10, 3).mean(axis=(1, 3))
+    none = seen(np.zeros((240, 480, 3)), np.zeros((240, 480), bool))
+    for picture in (enlarged(field, 240, 480, around=True), mixed(field, none, around=True)):
+        assert picture.shape == (240, 480, 3)
+        np.testing.assert_allclose(picture, whole, atol=4e-3)
+    cut = np.abs(enlarged(field, 240, 480)[:, 0] - whole[:, 0]).max()
+    assert cut > 8e-3, "without it there is one"
+    half = np.zeros((240, 480), bool)
+    half[:, :100] = half[:, -100:] = True
+    both = mixed(field, seen(np.array(whole), half), around=True)
+    np.testing.assert_allclose(both, whole, atol=6e-3)

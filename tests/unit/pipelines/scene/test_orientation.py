@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipelines.scene.orientation import (
     Similarity,
@@ -82,6 +83,56 @@ def test_a_few_rolled_cameras_do_not_tilt_the_rest() -> None:
     up, found_by = find_up(moved(truth, 1))
     assert found_by == "vertical"
     assert angle_deg(up, random_rotation(1) @ [0, 0, 1]) < 0.5
+
+
+def rolled(cameras: np.ndarray, roll_deg: float, which: slice = slice(None)) -> np.ndarray:
+    """Some of the cameras turned about what they look along."""
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    turned = cameras.copy()
+    turned[which, :, :2] = cameras[which, :, :2] @ np.array([[c, -s], [s, c]])
+    return turned
+
+
+@pytest.mark.parametrize("roll_deg", [90.0, -90.0])
+@pytest.mark.parametrize("arc_deg", [360.0, 200.0])
+def test_photos_that_lost_how_they_were_held_stand_all_the_same(
+    arc_deg: float, roll_deg: float
+) -> None:
+    truth = rolled(orbit(arc_deg=arc_deg), roll_deg)
+    rng = np.random.default_rng(1)
+    shaky = truth.copy()
+    shaky[:, :, :3] = [rotation_about(rng.normal(size=3) * 0.05) @ pose[:, :3] for pose in truth]
+    found = normalise(moved(shaky, 3))
+    assert found.up_from == "sideways"
+    back = found.similarity.apply_to_cameras(moved(truth, 3))
+    assert np.abs(back[:, 2, 1]).max() < 0.05, "Y axes are level"
+    assert np.sign(back[:, 2, 0].mean()) == np.sign(truth[:, 2, 0].mean())
+    assert back[:, 2, 2].mean() > 0.5, "they look down"
+
+
+def test_a_walk_around_at_the_things_height_is_on_its_side_where_it_goes_all_round() -> None:
+    """The X axes are parallel, as those of a camera that is tipped over a roof are."""
+    up, found_by = find_up(moved(rolled(orbit(height=0.0), -90.0), 6))
+    assert found_by == "sideways"
+    assert angle_deg(up, random_rotation(6) @ [0, 0, 1]) < 1e-3
+    over_it = [np.array([0.0, np.cos(a), np.sin(a)]) for a in np.radians(np.linspace(10, 80, 9))]
+    arc = np.stack([look_at(2.0 * place, np.zeros(3)) for place in over_it])
+    for tipped in (arc, rolled(orbit(height=0.0, arc_deg=150.0), -90.0)):
+        assert find_up(moved(tipped, 6))[1] == "camera_up"
+
+
+def test_what_may_be_held_either_way_is_taken_for_upright() -> None:
+    half = rolled(orbit(), 90.0, slice(0, None, 2))
+    assert find_up(moved(half, 2))[1] == "vertical"
+    few = rolled(orbit(), 90.0, slice(0, None, 5))
+    up, found_by = find_up(moved(few, 2))
+    assert found_by == "vertical"
+    assert angle_deg(up, random_rotation(2) @ [0, 0, 1]) < 2.0
+
+
+def rotation_about(vector: np.ndarray) -> np.ndarray:
+    """By the vector's length, in radians, about it."""
+    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def test_shaky_hands_cost_little() -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from pipelines.exports.paths.flight import (
     Flight,
+    held_upright,
     lens_of_size,
     looking_at,
     make_path,
@@ -16,6 +18,7 @@ from pipelines.exports.paths.flight import (
 )
 from pipelines.exports.paths.options import PathOptions
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
+from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.trained_scene import TrainedScene
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.scene.synthetic_views import look_at, ring
@@ -51,6 +54,38 @@ def test_the_typical_lens_is_centred_and_of_the_most_common_size() -> None:
     lens = typical_lens([other, wide, longer])
     assert (lens.width, lens.height, lens.cx, lens.cy) == (640, 480, 320.0, 240.0)
     assert lens.fl_x == 510.0
+
+
+@pytest.mark.parametrize("quarter", [0, 1, 3])
+def test_pictures_on_their_side_are_shown_upright(quarter: int) -> None:
+    """The same rays, in a picture turned by so many quarters."""
+    upright = np.array(ring(8, np.zeros(3)))
+    turn = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarter)
+    stored = upright.copy()
+    stored[:, :, :2] = upright[:, :, :2] @ turn
+    size = (40, 30) if quarter == 0 else (30, 40)
+    lens = Intrinsics(*size, 33.0, 35.0, size[0] / 2, size[1] / 2)
+    images = [
+        PosedImage(f"{index}.jpg", 0, tuple(tuple(map(float, row)) for row in pose))
+        for index, pose in enumerate(stored)
+    ]
+    shown, seen_by = held_upright(images, lens)
+    np.testing.assert_allclose([image.world_from_camera for image in shown], upright, atol=1e-12)
+    assert (seen_by.width, seen_by.height) == (40, 30)
+
+    def rays(one: Intrinsics, pose: np.ndarray) -> np.ndarray:
+        return Pinhole.of(one, 40).directions() @ pose[:, :3].T
+
+    before, after = rays(lens, stored[2]), rays(seen_by, upright[2])
+    np.testing.assert_allclose(np.rot90(before, quarter), after, atol=1e-12)
+
+
+def test_cameras_that_look_straight_down_are_left_as_they_are() -> None:
+    down = np.eye(3, 4)
+    images = [PosedImage("a.jpg", 0, tuple(tuple(map(float, row)) for row in down))]
+    lens = Intrinsics(40, 30, 33.0, 33.0, 20.0, 15.0)
+    assert held_upright(images, lens) == (images, lens)
+    assert held_upright([], lens) == ([], lens)
 
 
 def test_a_lens_of_another_size_fills_it_and_stretches_nothing() -> None:

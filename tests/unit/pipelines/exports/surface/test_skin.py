@@ -95,6 +95,58 @@ def test_what_was_filmed_from_nearby_is_filled_more_densely() -> None:
     assert 0.75 < nearer.mean() < 0.85, "of a face twice as near there is four times as much"
 
 
+def test_what_no_camera_sees_is_not_filled() -> None:
+    """A mesh that somebody closed: its base faces the floor, and a lid hides half of the square."""
+    base = sheet()
+    flat = TexturedMesh(
+        np.concatenate([base.vertices, base.vertices - [0.0, 0.0, 0.5]]),
+        np.concatenate([base.faces, base.faces[:, ::-1] + 4]).astype(np.int32),
+        np.concatenate([base.normals, -base.normals]),
+        np.concatenate([base.uv, base.uv]),
+        base.texture,
+    )
+    filling = Skin(flat).filling(cloud_at(grid(60, most_x=0.5)), EYES, 1600, seed=0)
+    assert len(filling) > 50
+    np.testing.assert_allclose(filling.points[:, 2], 0.0, atol=1e-12)
+    assert ((filling.eyes - filling.points) * filling.normals).sum(axis=1).min() > 0.0
+    hidden = TexturedMesh(flat.vertices, flat.faces, np.abs(flat.normals), flat.uv, flat.texture)
+    filling = Skin(hidden).filling(cloud_at(grid(60, most_x=0.5)), EYES, 1600, seed=0)
+    np.testing.assert_allclose(filling.points[:, 2], 0.0, atol=1e-12)
+    from_below = np.array([[0.5, 0.5, -2.0]])
+    assert len(Skin(sheet()).filling(cloud_at(np.zeros((0, 3))), from_below, 1600, seed=0)) == 0
+
+
+def test_a_part_is_filled_as_densely_as_its_share_of_the_cloud_asks() -> None:
+    """A crop of the mesh under a cloud of all, and a crop of the cloud on a mesh of all."""
+    even = grid(60) * [3.0, 3.0, 0.0] - [1.0, 1.0, 0.0]  # nine times the square, 400 points on it
+    on_it = Cloud(even, np.full((3600, 3), 9, np.uint8), even, np.tile([0.0, 0.0, 1.0], (3600, 1)))
+    assert len(Skin(sheet()).filling(on_it, EYES, 3600, seed=0)) == 0
+    gone = on_it.take((even[:, 0] < 0.0) | (even[:, 0] > 1.0))
+    assert len(Skin(sheet()).filling(gone, EYES, 3600, seed=0)) < 60
+    few = grid(60)[::50]
+
+    def inside(points: np.ndarray) -> np.ndarray:
+        return (points[:, 0] < 0.5) & (points[:, 1] < 0.5)
+
+    filling = Skin(fine_sheet(8)).filling(cloud_at(few), EYES, 1600, seed=0, inside=inside)
+    assert inside(filling.points).all()
+    assert len(filling) > 250, "all the places that there are for 1,600 points lie in the crop"
+
+
+def fine_sheet(count: int) -> TexturedMesh:
+    """The square of so many by so many cells."""
+    mesh = sheet()
+    x, y = np.meshgrid(np.linspace(0.0, 1.0, count + 1), np.linspace(0.0, 1.0, count + 1))
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (
+        part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1])
+    )
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
+    return TexturedMesh(vertices, faces.astype(np.int32), up, vertices[:, :2].copy(), mesh.texture)
+
+
 def test_it_can_be_cancelled_and_a_mesh_without_faces_is_refused() -> None:
     def stop(_: float) -> None:
         raise Cancelled("enough")

@@ -281,3 +281,13 @@ def test_by_day_what_a_sensor_measures_is_no_sky() -> None:
     depths = [one.known().z for one in seen]
     assert find_sky(*given, depths, UP, NO_POINTS, hall).share == 0.0
     assert find_sky(*given, depths, UP, NO_POINTS, [None] * len(seen)).by_day
+
+
+def test_a_picture_of_which_a_mask_hides_all_has_no_sky() -> None:
+    seen = by_day()
+    hidden = dataclasses.replace(seen[2].view, picture=np.full_like(seen[2].view.picture, -1.0))
+    seen[2] = dataclasses.replace(seen[2], view=hidden)
+    found = sky_of(seen)
+    assert not found.masks[2].any()
+    assert found.by_day
+    assert not like_sky(seen[2].view, seen[2].picture, UP, NO_POINTS, by_day=True).any()
