@@ -112,13 +112,14 @@ def as_viewed(world_from_camera: Matrix, orientations: Sequence[int | None]) -> 
 def other_axis_up(poses: Matrix) -> tuple[str, Matrix] | None:
     """The axis of a world that is up in its pictures, and the quarter turn that makes it +Z.
 
-    poses: [N, 3, 4], OpenGL cameras. None where that is +Z, and where it is not clear: pictures
-    stored on their side have level X axes in a world that lies.
+    poses: [N, 3, 4], OpenGL cameras. None where that is +Z, and where it is not clear: of an arc
+    pictures stored on their side may have level X axes in a world that lies.
     """
     up, found_by = find_up(poses)
     axis = int(np.abs(up).argmax())
-    sideways = float(np.abs(poses[:, 2, 0]).mean()) > _SIDEWAYS
-    if found_by != "vertical" or sideways or abs(up[axis]) < _CLEARLY or up[2] >= _CLEARLY:
+    stored_so = float(np.abs(poses[:, 2, 0]).mean()) > _SIDEWAYS
+    clear = found_by == "sideways" or (found_by == "vertical" and not stored_so)
+    if not clear or abs(up[axis]) < _CLEARLY or up[2] >= _CLEARLY:
         return None
     direction = np.zeros(3)
     direction[axis] = np.sign(up[axis])

@@ -10,6 +10,7 @@ import pytest
 from pipelines.captures.world import as_viewed, other_axis_up, settled
 from pipelines.sample.film import phone_camera, walk
 from pipelines.sample.scene import pose_matrix
+from tests.unit.pipelines.scene.synthetic_views import ring
 
 QUARTERS = {
     "+Y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -46,6 +47,22 @@ def test_an_upright_world_stays_as_it_is_however_pictures_are_stored() -> None:
         sideways = upright.copy()
         sideways[:, :, :3] = upright[:, :, :3] @ np.array(turn)
         assert other_axis_up(sideways) is None
+
+
+@pytest.mark.parametrize(
+    "turn", [[[0, 1, 0], [-1, 0, 0], [0, 0, 1]], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]]
+)
+def test_a_world_that_lies_is_turned_up_by_pictures_on_their_side_too(
+    turn: list[list[int]],
+) -> None:
+    """Where somebody went all round the thing."""
+    upright = np.array(ring(24, np.zeros(3)))
+    sideways = upright.copy()
+    sideways[:, :, :3] = upright[:, :, :3] @ np.array(turn, float)
+    assert other_axis_up(sideways) is None
+    found = other_axis_up(QUARTERS["+Y"] @ sideways)
+    assert found is not None
+    assert found[0] == "+Y"
 
 
 def test_a_world_that_leans_between_its_axes_is_left_alone() -> None:
