@@ -33,6 +33,7 @@ from pipelines.exports.surface.carving import Seen, carved
 from pipelines.exports.surface.holes import close_holes, hole_limits
 from pipelines.exports.surface.outlines import outlined
 from pipelines.exports.surface.refinement import refined
+from pipelines.exports.surface.seams import seamless
 from pipelines.exports.surface.shells import (
     Method,
     Shell,
@@ -169,6 +170,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
             )
         if options.refine == "photos":
             mesh = _on_the_photos(mesh, scene, shells, options, ctx)
+        mesh = seamless(mesh, shells)
         told = ctx.told_part("closing holes", _MEND_SHARE, _CLOSED_SHARE)
         limits = hole_limits(shells, options.close_holes, options.max_distance)
         closing = close_holes(mesh, limits, store, told)

@@ -59,7 +59,7 @@ def in_large_pieces(vertices: Floats, faces: NDArray[np.integer]) -> NDArray[np.
     """
     if len(faces) == 0:
         return np.zeros(0, np.bool_)
-    piece = _pieces(faces, len(vertices))
+    piece = piece_of_faces(faces, len(vertices))
     first = vertices[faces[:, 0]]
     across = np.cross(vertices[faces[:, 1]] - first, vertices[faces[:, 2]] - first)
     areas = np.bincount(piece, np.linalg.norm(across, axis=1))
@@ -67,8 +67,8 @@ def in_large_pieces(vertices: Floats, faces: NDArray[np.integer]) -> NDArray[np.
     return kept
 
 
-def _pieces(faces: NDArray[np.integer], num_vertices: int) -> NDArray[np.integer]:
-    """[F], a number for each piece of faces that share edges."""
+def piece_of_faces(faces: NDArray[np.integer], num_vertices: int) -> NDArray[np.integer]:
+    """[F], which piece each of faces [F, 3] belongs to, counted from 0: what shares edges."""
     starts, ends = (faces[:, order].T.reshape(-1) for order in ([0, 1, 2], [1, 2, 0]))
     edge = np.minimum(starts, ends).astype(np.int64) * num_vertices + np.maximum(starts, ends)
     order = np.argsort(edge)
