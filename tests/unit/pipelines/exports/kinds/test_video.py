@@ -154,10 +154,12 @@ def _pictures(job: Workspace, **changes: Any) -> dict[str, np.ndarray]:
         }
 
 
-def _still(job: Workspace, long_side_px: int, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+def _still(
+    job: Workspace, long_side_px: int, which: int = 0, **options: Any
+) -> tuple[np.ndarray, dict[str, Any]]:
     """A frame from where a photo was taken that training held out, and the summary."""
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
-    image = next(image for image in cameras.images if image.split == "test")
+    image = [image for image in cameras.images if image.split == "test"][which]
     lens = cameras.cameras[image.camera]
     fov = float(np.degrees(2.0 * np.arctan(lens.height / (2.0 * lens.fl_y))))
     pose = np.vstack([image.world_from_camera, [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
@@ -175,26 +177,28 @@ def _still(job: Workspace, long_side_px: int, **options: Any) -> tuple[np.ndarra
         return np.asarray(Image.open(archive.open("rgb/00001.png"))).astype(float), summary
 
 
-def _held_out_photo(job: Workspace) -> np.ndarray:
+def _held_out_photo(job: Workspace, which: int) -> np.ndarray:
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
-    image = next(image for image in cameras.images if image.split == "test")
+    image = [image for image in cameras.images if image.split == "test"][which]
     return np.asarray(Image.open(job.images_root / image.file).convert("RGB")).astype(float)
 
 
 def test_the_mesh_makes_the_film_more_like_photos_that_training_never_saw(job: Workspace) -> None:
     tiny_job.run(job, "mesh", formats=("glb",))
-    photo = _held_out_photo(job)
-    alone, told = _still(job, 64, mesh_detail=False)
-    assert told["mesh_detail"] is False
-    both, told = _still(job, 64)
-    assert told["mesh_detail"] is True
-    assert both.shape == photo.shape == alone.shape
-    small, _ = _still(job, 64, field_px=32)
-    error, error_small, error_alone = (
-        np.square(picture - photo).mean() for picture in (both, small, alone)
-    )
-    assert error < 0.95 * error_alone
-    assert error < error_small
+    errors = []
+    for which in range(3):
+        photo = _held_out_photo(job, which)
+        alone, told = _still(job, 64, which, mesh_detail=False)
+        assert told["mesh_detail"] is False
+        both, told = _still(job, 64, which)
+        assert told["mesh_detail"] is True
+        small, _ = _still(job, 64, which, field_px=32)
+        assert both.shape == photo.shape == alone.shape
+        errors.append([np.square(shown - photo).mean() for shown in (both, small, alone)])
+    error, error_small, error_alone = np.transpose(errors)
+    assert (error < error_alone).all()
+    assert (error < error_small).all()
+    assert error.mean() < 0.97 * error_alone.mean()
 
 
 def test_a_job_without_a_picture_on_its_mesh_films_what_was_trained(job: Workspace) -> None:
