@@ -82,7 +82,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
 
 EXPORT = Export(
     kind="meshvideo",
-    version=1,
+    version=2,
     reads=("mesh",),
     run=run,
     options=MeshVideoOptions,
