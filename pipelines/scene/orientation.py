@@ -131,7 +131,8 @@ def _up_of_pictures_on_their_side(world_from_camera: Array) -> Array | None:
     if up is None:
         return None
     if other is None:
-        if _turned_through_deg(y_axes) < _ALL_ROUND_DEG:
+        held = x_axes @ x_axes.mean(axis=0) > 0.0  # not upside down
+        if _turned_through_deg(y_axes[held]) < _ALL_ROUND_DEG:
             return None
     else:
         off = float(np.abs(x_axes @ other).mean())
@@ -155,6 +156,8 @@ def _turned_through_deg(axes: Array) -> float:
     gap."""
     _, _, rows = np.linalg.svd(axes, full_matrices=False)
     angles = np.sort(np.degrees(np.arctan2(axes @ rows[1], axes @ rows[0])))
+    if len(angles) == 0:
+        return 0.0
     gaps = np.diff(angles, append=angles[0] + 360.0)
     return 360.0 - float(gaps.max())
 

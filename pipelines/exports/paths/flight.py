@@ -20,8 +20,9 @@ Floats = NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STEEP = 1e-4
-_ON_THEIR_SIDE = 0.7
-"""Median height of cameras' X axes from which pictures are turned for who watches."""
+_ON_THEIR_SIDE, _CLEARLY = 0.3, 2.0
+"""Median height of cameras' X axes, and how many times that of their Y axes it is, from which
+pictures are turned for who watches: from steeply above both are low."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ def held_upright(
     """
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     right = float(np.median(poses[:, 2, 0])) if len(poses) else 0.0
-    if abs(right) < _ON_THEIR_SIDE:
+    top = float(np.median(poses[:, 2, 1])) if len(poses) else 0.0
+    if abs(right) < max(_ON_THEIR_SIDE, _CLEARLY * abs(top)):
         return images, lens
     # The new X and Y axes in the old ones: what was at the right, or at the left, is above now.
     turn = (

@@ -117,7 +117,8 @@ def test_a_walk_around_at_the_things_height_is_on_its_side_where_it_goes_all_rou
     assert angle_deg(up, random_rotation(6) @ [0, 0, 1]) < 1e-3
     over_it = [np.array([0.0, np.cos(a), np.sin(a)]) for a in np.radians(np.linspace(10, 80, 9))]
     arc = np.stack([look_at(2.0 * place, np.zeros(3)) for place in over_it])
-    for tipped in (arc, rolled(orbit(height=0.0, arc_deg=150.0), -90.0)):
+    overhead = rolled(arc, 180.0, slice(2, 5))
+    for tipped in (arc, overhead, rolled(orbit(height=0.0, arc_deg=150.0), -90.0)):
         assert find_up(moved(tipped, 6))[1] == "camera_up"
 
 

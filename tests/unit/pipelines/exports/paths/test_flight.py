@@ -80,6 +80,18 @@ def test_pictures_on_their_side_are_shown_upright(quarter: int) -> None:
     np.testing.assert_allclose(np.rot90(before, quarter), after, atol=1e-12)
 
 
+def test_pictures_on_their_side_from_steeply_above_are_shown_upright_too() -> None:
+    place = np.array([0.0, -1.0, 1.8])  # 61 degrees down
+    pose = look_at(place, np.zeros(3))
+    for turn, is_turned in (([[0.0, -1.0], [1.0, 0.0]], True), (np.eye(2), False)):
+        stored = pose.copy()
+        stored[:, :2] = pose[:, :2] @ np.array(turn)
+        images = [PosedImage("a.jpg", 0, tuple(tuple(map(float, row)) for row in stored))]
+        shown, lens = held_upright(images, Intrinsics(40, 30, 33.0, 33.0, 20.0, 15.0))
+        assert (lens.width == 30) == is_turned
+        np.testing.assert_allclose(shown[0].world_from_camera, pose, atol=1e-12)
+
+
 def test_cameras_that_look_straight_down_are_left_as_they_are() -> None:
     down = np.eye(3, 4)
     images = [PosedImage("a.jpg", 0, tuple(tuple(map(float, row)) for row in down))]
