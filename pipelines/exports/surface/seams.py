@@ -81,6 +81,6 @@ def _moves(
     aside = np.sqrt(np.maximum((way * way).sum(axis=1) - off * off, 0.0))
     share = np.clip(1.0 - aside / (_BAND * voxel), 0.0, 1.0)
     share *= np.clip((_ANOTHER - np.abs(off) / voxel) / (_ANOTHER - _SAME), 0.0, 1.0)
-    share *= np.abs((normals * across).sum(axis=1)) >= _ALIKE
+    share *= (normals * across).sum(axis=1) >= _ALIKE
     moves: Floats = (share * off)[:, None] * across
     return moves

@@ -84,6 +84,11 @@ def test_what_is_another_surface_stays() -> None:
     lid = two(2.1 * VOXEL, np.zeros(3))
     after = seamless(lid, shells(np.zeros(3)))
     np.testing.assert_allclose(after.vertices, lid.vertices, atol=1e-12)
+    far_side = two(0.5 * VOXEL, np.zeros(3))
+    back = far_side.vertices[:, 2] > 0.0
+    far_side.normals[back] *= -1.0
+    after = seamless(far_side, shells(np.zeros(3)))
+    np.testing.assert_allclose(after.vertices, far_side.vertices, atol=1e-12)
     standing = plate(VOXEL, 0.0, 0.5, 0.0)
     turned = standing.vertices[:, [2, 1, 0]] + [1.0 + 0.5 * VOXEL, 0.0, 0.6]
     wall = TriangleMesh(
