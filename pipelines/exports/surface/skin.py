@@ -141,13 +141,15 @@ class Skin:
         """Of a cloud's points on the surface that the mesh was made of, the share that the mesh
         still has: a crop of it is not to be filled for all."""
         which = np.flatnonzero(cloud.normals.any(axis=1))
-        which = which[:: max(len(which) // _MOST_ASKED, 1)]
         if len(which) == 0:
             return 1.0
+        every = max(len(which) // _MOST_ASKED, 1)
+        which = which[::every]
         local = cloud.points[which] - self._origin
         found = self._scene.compute_closest_points(_core.Tensor(local.astype(np.float32)))
         away = np.linalg.norm(found["points"].numpy() - local, axis=1)
-        return float((away <= _AWAY * point_spacing(local)).mean())
+        spacing = point_spacing(local) / np.sqrt(every)  # of all of them
+        return float((away <= _AWAY * spacing).mean())
 
     def _seen_by(
         self, points: Floats, normals: Floats, eyes: Floats, poll: Callable[[], None]

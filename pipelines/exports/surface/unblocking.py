@@ -55,11 +55,12 @@ def unblocked(
             _core.Tensor((mesh.vertices - origin).astype(np.float32)),
             _core.Tensor(faces.astype(np.uint32)),
         )
+        centers = sum(mesh.vertices[corner] for corner in faces.T) / 3.0
         blocking = np.zeros(len(faces), np.bool_)
         blocked = []
         for done, (part, index) in enumerate(asked):
             on_progress((turn + done / len(asked)) / _MOST_ROUNDS)
-            found = _blocking(scene, part[index], origin, mesh.vertices, faces)
+            found = _blocking(scene, part[index], origin, centers)
             if len(found):
                 blocking[found] = True
                 blocked.append((part, index))
@@ -73,10 +74,12 @@ def _blocking(
     scene: Any,
     view: DepthView,
     origin: Floats,
-    vertices: Floats,
-    faces: NDArray[np.int32],
+    centers: Floats,
 ) -> NDArray[np.int64]:
-    """The faces that stand before a view: those that rays meet, and the smaller ones between."""
+    """The faces that stand before a view: those that rays meet, and the smaller ones between.
+
+    origin: [3], of the scene. centers: [F, 3], of its faces, in the world.
+    """
     every = max(round(max(view.z_depth.shape) / _RAYS), 1)
     known = view.z_depth[::every, ::every]
     ways = view.lens.directions()[::every, ::every]  # of z depth 1
@@ -89,7 +92,7 @@ def _blocking(
     near = binary_propagation(patches, _WHOLE, mask=hides)
     if not near.any():
         return np.zeros(0, np.int64)
-    x, y, back = ((vertices[faces].mean(axis=1) - pose[:, 3]) @ pose[:, :3]).T
+    x, y, back = ((centers - pose[:, 3]) @ pose[:, :3]).T
     z = np.where(back < 0.0, -back, np.inf)
     lens = view.lens
     column = np.floor((lens.cx + lens.fl_x * x / z) / every)

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.errors import Cancelled
 from pipelines.exports.mesh import TexturedMesh
+from pipelines.exports.surface import skin
 from pipelines.exports.surface.cloud import Cloud
 from pipelines.exports.surface.skin import Skin
 
@@ -116,8 +117,12 @@ def test_what_no_camera_sees_is_not_filled() -> None:
     assert len(Skin(sheet()).filling(cloud_at(np.zeros((0, 3))), from_below, 1600, seed=0)) == 0
 
 
-def test_a_part_is_filled_as_densely_as_its_share_of_the_cloud_asks() -> None:
+@pytest.mark.parametrize("asked", [20_000, 400])
+def test_a_part_is_filled_as_densely_as_its_share_of_the_cloud_asks(
+    asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A crop of the mesh under a cloud of all, and a crop of the cloud on a mesh of all."""
+    monkeypatch.setattr(skin, "_MOST_ASKED", asked)
     even = grid(60) * [3.0, 3.0, 0.0] - [1.0, 1.0, 0.0]  # nine times the square, 400 points on it
     on_it = Cloud(even, np.full((3600, 3), 9, np.uint8), even, np.tile([0.0, 0.0, 1.0], (3600, 1)))
     assert len(Skin(sheet()).filling(on_it, EYES, 3600, seed=0)) == 0
