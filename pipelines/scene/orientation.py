@@ -109,7 +109,7 @@ def find_up(
     mean_up: Array = world_from_camera[:, :, 1].mean(axis=0)
     if (up := _level_to(x_axes)) is not None:
         return up * _sign_of_up(up, world_from_camera), "vertical"
-    _, _, rows = np.linalg.svd(x_axes, full_matrices=True)
+    _, _, rows = np.linalg.svd(x_axes, full_matrices=False)
     level = mean_up - rows[0] * float(mean_up @ rows[0])
     if _share_upside_down(world_from_camera[:, :, 1]) >= _MANY_UPSIDE_DOWN:
         level = world_from_camera[:, :, 2].mean(axis=0)  # nobody takes a wall so: all look down
@@ -145,10 +145,10 @@ def _up_of_pictures_on_their_side(world_from_camera: Array) -> Array | None:
 
 def _level_to(axes: Array) -> Array | None:
     """The direction [3] that axes [N, 3] are most orthogonal to; None where they are parallel."""
-    _, singular, rows = np.linalg.svd(axes, full_matrices=True)
-    if len(axes) < 2 or singular[1] < _MIN_TURN * np.sqrt(len(axes)):
+    squares, directions = np.linalg.eigh(axes.T @ axes / len(axes))
+    if squares[1] < _MIN_TURN**2:
         return None
-    return _most_orthogonal(axes, rows[2])
+    return _most_orthogonal(axes, directions[:, 0])
 
 
 def _turned_through_deg(axes: Array) -> float:
