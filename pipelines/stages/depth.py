@@ -265,6 +265,7 @@ class _Search:
             told["blank"] = _rounded(blank.share, blank.num_views)
             if blank.color is not None:
                 told["blank"]["color"] = list(blank.color)
+                told["blank"]["is_paper"] = blank.is_paper
                 masks = blank.masks
         is_cut_out = told.get("blank", {}).get("share", 0.0) > 0.0
         if self.config.find_sky and not is_cut_out:

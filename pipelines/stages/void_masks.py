@@ -98,9 +98,11 @@ def _looks(workspace: Workspace, capture: CamerasFile, told: dict[str, Any]) -> 
     blank = told.get("blank", {})
     if blank.get("share") and blank.get("by") != BY_CUTS:
         on_thing, (red, green, blue) = _solid_points(workspace, capture), blank["color"]
-        color = (red, green, blue)
+        color, is_paper = (red, green, blue), bool(blank.get("is_paper"))
         looks.append(
-            lambda view, picture: blank_of(view, like_blank(view, picture, color), on_thing)
+            lambda view, picture: blank_of(
+                view, like_blank(view, picture, color, is_paper=is_paper), on_thing
+            )
         )
     sky = told.get("sky", {})
     if sky.get("share"):

@@ -131,3 +131,73 @@ def test_what_a_sensor_measures_is_not_nothing() -> None:
     alone: list[np.ndarray | None] = [one.depth for one in seen]
     assert blank_in(seen, alone).share > 0.5
     assert blank_in(seen, [None] * len(seen)).share > 0.5
+
+
+def before_paper(noise: int, brightest: int = 255) -> list[Seen]:
+    """The cut-out pictures before paper that is burnt out in the upper two thirds, and fades."""
+    random = np.random.default_rng(5)
+    seen = []
+    for one in in_the_dark():
+        height = one.depth.shape[0]
+        fading = np.interp(np.arange(height), [0.65 * height, height - 1], [0.0, 35.0])
+        paper = np.array([255.0, 251.0, 247.0]) - (255 - brightest) - fading[:, None, None]
+        paper = paper + random.integers(-noise, noise + 1, one.picture.shape)
+        picture = np.where(one.is_void[..., None], np.clip(paper, 0, 255), one.picture)
+        seen.append(dataclasses.replace(one, picture=picture.astype(np.uint8)))
+    return seen
+
+
+def test_what_paper_fades_into_is_paper() -> None:
+    seen = before_paper(2)
+    found = blank_in(seen)
+    assert found.is_paper
+    assert found.color is not None
+    for one, mask in zip(seen, found.masks, strict=True):
+        strict, _ = like_blank(one.view, one.picture, found.color)
+        assert strict[one.is_void].mean() < 0.9
+        assert mask[one.is_void].mean() > 0.97
+        assert mask[~one.is_void].mean() < 0.01
+
+
+def test_only_paper_that_is_burnt_out_fades() -> None:
+    assert not blank_in(before_paper(0)).is_paper
+    for seen in (before_paper(0), before_paper(2, brightest=200)):
+        found = blank_in(seen)
+        assert found.share > 0.3
+        assert not found.is_paper
+        for one, mask in zip(seen, found.masks, strict=True):
+            assert mask[one.is_void].mean() < 0.9
+
+
+def test_a_shadow_with_a_border_is_no_paper() -> None:
+    one = before_paper(1)[0]
+    shadow = np.zeros(one.depth.shape, np.bool_)
+    shadow[80:100, 5:30] = True
+    assert one.is_void[shadow].all()
+    picture = one.picture.copy()
+    picture[shadow] -= 25
+    looks = like_blank(one.view, picture, (255, 251, 247), is_paper=True)
+    found = blank_of(one.view, looks, np.zeros((0, 3)))
+    assert not found[shadow].any()
+    assert found[one.is_void & ~shadow].mean() > 0.97
+
+
+def test_a_white_thing_before_paper_is_no_paper() -> None:
+    """Where it fades into the paper, what other views know of it says that it is there."""
+    pale, fringes = [], []
+    for number, one in enumerate(before_paper(2)):
+        rows, columns = np.indices(one.depth.shape)
+        fringe = (one.what == ON_PILLAR) & (rows < 60) & (columns < 60) & (number % 5 == 0)
+        begins = np.where(fringe.any(axis=1), fringe.argmax(axis=1), 0)
+        faded = np.array([253, 249, 245]) - 2 * (columns - begins[:, None])[..., None]
+        picture = np.where(fringe[..., None], faded, one.picture).astype(np.uint8)
+        pale.append(dataclasses.replace(one, picture=picture))
+        fringes.append(fringe)
+    found = blank_in(pale)
+    assert found.is_paper
+    assert found.color is not None
+    for one, fringe, mask in zip(pale, fringes, found.masks, strict=True):
+        if fringe.any():
+            around, maybe = like_blank(one.view, one.picture, found.color, is_paper=True)
+            assert maybe[fringe].mean() > 0.5
+            assert (mask & ~around)[fringe].mean() < 0.2
