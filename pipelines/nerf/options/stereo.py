@@ -58,7 +58,8 @@ class StereoConfig:
     find_blank: bool = option(
         True,
         "Tell the blank ground of pictures that a thing was cut out of, of one colour or "
-        "transparent, from the thing: it has no depth, and training lets light through there.",
+        "transparent, or the burnt-out paper of a light tent, from the thing: it has no depth, and "
+        "training lets light through there.",
     )
     complete_planes: bool = option(
         True,
