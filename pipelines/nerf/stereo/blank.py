@@ -43,7 +43,7 @@ unlit sides."""
 _BURNT_OUT, _MOST_EXACT, _EXACT_OFF = 250, 0.8, 1
 """A ground that was photographed, and is no colour that a program left: its brightest channel; of
 what has its colour at a picture's border, how much is as near to it as `_EXACT_OFF`, in the median
-picture. JPEG leaves 1.00 of what is one colour, and .1 to .6 was seen of a tent's paper."""
+picture. What a program laid is one colour but for JPEG near edges; of one tent's, up to .6 was."""
 _PAPER_OFF, _PAPER_STEP = 40, 8
 """Levels that a paper may be darker than where it is burnt out, and from a pixel to the next. A
 shadow's border is steeper, and so is a thing's."""
