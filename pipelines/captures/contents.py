@@ -32,8 +32,8 @@ class Photos:
 class SensorDepth:
     """Depth that the phone measured beside a picture, along the camera's axis (z, not the ray).
 
-    name: in the archive, a 16-bit PNG or an OpenEXR. It shows what the picture shows, at a
-    resolution of its own. unit: world units per stored value. lens: where another one than the
+    name: in the archive, of a format that `depth_files` reads. It shows what the picture shows, at
+    a resolution of its own. unit: world units per stored value. lens: where another one than the
     picture's shows it, that lens for a picture of the size it is called with.
     confidence: a picture of the same size, or None; where it is below `least_confidence`, the depth
     counts as unknown.

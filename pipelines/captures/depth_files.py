@@ -1,13 +1,16 @@
 """Depth that a phone's sensor measured, out of an archive: decoded, checked, in world units.
 
-Read are pictures of one channel and 16 bits in PNG, and the R channel of OpenEXR (Record3D's), and
-nothing else. What is not finite, not above 0, not trusted or at the end of what 16 bits can count
-becomes 0, unknown. A map that cannot be used never costs its picture: it is left out and told.
+Read are pictures of one channel and 16 bits or more in PNG and TIFF, OpenEXR's R (Record3D's) or
+what renderers call their depth there, and plain arrays of NumPy, and nothing else. What is not
+finite, not above 0, not trusted or at the end of what its numbers can count becomes 0, unknown. A
+map that cannot be used never costs its picture: it is left out and told.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import SensorDepth
-from pipelines.captures.magic import image_format, is_exr
+from pipelines.captures.magic import image_format, is_exr, is_npy
 from pipelines.captures.parsing import some_of
 from pipelines.captures.pictures import opened
 from pipelines.captures.unpack import CaptureArchive
@@ -25,8 +28,27 @@ from pipelines.scene.sensor_depth import Depths, save_sensor_depth
 _FOLDER = "depth"
 _ASPECT_SLACK = 0.02
 _MOST_CHANNELS = 4
-_ONE_CHANNEL = ("L", "I", "I;16", "I;16L", "I;16B", "I;16N")
-"""Pillow's modes of pictures with one channel of numbers, of 8 bits or 16."""
+_ONE_CHANNEL = ("L", "I", "I;16", "I;16L", "I;16B", "I;16N", "F")
+"""Pillow's modes of pictures with one channel of numbers, of 8 bits or more."""
+_EXR_CHANNELS = ("R", "Z", "Y", "V")
+"""Of OpenEXR, the first that is there: what apps, renderers, OpenCV and Blender write depth in, the
+latter with a layer's name before a dot."""
+_NO_CHANNEL = "has no channel R, Z, Y or V of plain numbers"
+_NOTHING_THERE = 65504.0
+"""Where numbers with a fraction are no less, nothing was met: the largest that 16 bits hold, or
+what renderers write in its place (1e10)."""
+_BAD_ARRAY = (
+    ValueError,
+    TypeError,
+    OverflowError,
+    EOFError,
+    SyntaxError,
+    TokenError,
+    RecursionError,
+    MemoryError,
+    OSError,
+)
+"""What NumPy raises for a damaged array: its header is read as Python's literals are."""
 
 
 class DepthWriter:
@@ -105,7 +127,11 @@ class DepthWriter:
         if is_exr(head):
             self._archive.extract(name, self._raw)
             return _exr_channel(self._raw, name, self._max_pixels)
-        values = self._one_channel(name)
+        if is_npy(head):
+            self._archive.extract(name, self._raw)
+            values = _npy_array(self._raw, name, self._max_pixels)
+        else:
+            values = self._one_channel(name)
         if values.itemsize == 1:
             raise _unusable(name, "has 8 bits; 16 are needed")
         return values
@@ -121,11 +147,12 @@ class DepthWriter:
         return values
 
     def _one_channel(self, name: str) -> NDArray[Any]:
-        """A PNG of one channel, [h, w]."""
-        if image_format(self._archive.head(name)) != "PNG":
-            raise _unusable(name, "is neither a PNG nor OpenEXR")
+        """A PNG or TIFF of one channel, [h, w]."""
+        kind = image_format(self._archive.head(name))
+        if kind not in ("PNG", "TIFF"):
+            raise _unusable(name, "is neither a PNG, a TIFF, OpenEXR nor NumPy's .npy")
         self._archive.extract(name, self._raw)
-        with opened(self._raw, name, "PNG", self._max_pixels) as image:
+        with opened(self._raw, name, kind, self._max_pixels) as image:
             if image.mode not in _ONE_CHANNEL:
                 raise _unusable(name, f"has colours ({image.mode}) in place of one channel")
             return np.asarray(image)
@@ -133,14 +160,39 @@ class DepthWriter:
 
 def _at_its_end(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Where counts are the largest that their type has: nothing was measured, or more than fits."""
-    if values.dtype.kind != "u":
-        return np.zeros(values.shape, bool)
-    ends: NDArray[np.bool_] = values == np.iinfo(values.dtype).max
+    ends: NDArray[np.bool_]
+    if values.dtype.kind == "f":
+        ends = values >= _NOTHING_THERE
+    elif values.dtype.kind == "u":
+        ends = values == np.iinfo(values.dtype).max
+    else:
+        ends = np.zeros(values.shape, np.bool_)
     return ends
 
 
+def _npy_array(path: Path, name: str, max_pixels: int) -> NDArray[Any]:
+    """An array of NumPy's, [h, w], or with one channel. Nothing that would have to be executed.
+
+    The file is mapped first, so that a header that promises more than there is takes no memory.
+    """
+    try:
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except _BAD_ARRAY as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the disk's fault, not the file's
+        raise _unusable(name, "does not decode") from error
+    rows = [length for length in mapped.shape if length != 1]
+    if len(rows) != 2 or mapped.dtype.kind not in "uif":
+        raise _unusable(
+            name, f"has {mapped.shape} values of {mapped.dtype}, not one for each pixel"
+        )
+    if not 0 < mapped.size <= max_pixels:
+        raise _unusable(name, f"has {rows[1]}x{rows[0]} pixels; {max_pixels} are allowed")
+    return np.array(mapped.reshape(rows))
+
+
 def _exr_channel(path: Path, name: str, max_pixels: int) -> NDArray[Any]:
-    """The R channel of an OpenEXR file, [h, w].
+    """The depth of an OpenEXR file, [h, w]: the first of `_EXR_CHANNELS` that it has.
 
     The headers are looked at before any pixel: size, one plain image, few channels. A damaged part
     is left out by the library, with a line on stdout, and no part is left then.
@@ -154,14 +206,21 @@ def _exr_channel(path: Path, name: str, max_pixels: int) -> NDArray[Any]:
             raise _unusable(name, why)
         # Without `separate_channels` R, G and B would come as one array.
         with OpenEXR.File(str(path), separate_channels=True, num_threads=0) as file:
-            pixels = np.array(file.channels()["R"].pixels)
+            channels = file.channels()
+            pixels = np.array(channels[_depth_channel(channels)].pixels)
     except (RuntimeError, ValueError, TypeError, LookupError, OSError, OpenEXR.error) as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise  # the disk's fault, not the file's
         raise _unusable(name, "does not decode") from error
     if pixels.ndim != 2 or pixels.dtype.kind != "f":
-        raise _unusable(name, "has no channel R of plain numbers")
+        raise _unusable(name, _NO_CHANNEL)
     return pixels
+
+
+def _depth_channel(names: Iterable[str]) -> str:
+    """Which of an OpenEXR's channels holds depth; "" for none."""
+    found = {name.rsplit(".", 1)[-1]: name for name in names}
+    return next((found[channel] for channel in _EXR_CHANNELS if channel in found), "")
 
 
 def _exr_fault(parts: list[Any], max_pixels: int) -> str:
@@ -174,9 +233,9 @@ def _exr_fault(parts: list[Any], max_pixels: int) -> str:
     if header.get("type", OpenEXR.scanlineimage) != OpenEXR.scanlineimage:
         return "is tiled or deep"
     channels = header["channels"]
-    red = [item for item in channels if item.name == "R"]
-    if len(channels) > _MOST_CHANNELS or not red or (red[0].xSampling, red[0].ySampling) != (1, 1):
-        return "has no channel R of plain numbers"
+    by_name = {item.name: (item.xSampling, item.ySampling) for item in channels}
+    if len(channels) > _MOST_CHANNELS or by_name.get(_depth_channel(by_name)) != (1, 1):
+        return _NO_CHANNEL
     (left, top), (right, bottom) = ([int(value) for value in row] for row in header["dataWindow"])
     width, height = right - left + 1, bottom - top + 1
     if width < 1 or height < 1 or width * height > max_pixels:

@@ -70,6 +70,11 @@ def is_exr(head: bytes) -> bool:
     return head[:4] == b"\x76\x2f\x31\x01"
 
 
+def is_npy(head: bytes) -> bool:
+    """Whether the bytes open an array as NumPy saves it."""
+    return head[:6] == b"\x93NUMPY"
+
+
 def foreign_image(head: bytes) -> str | None:
     """The name of a picture format that is recognised but not read ("GIF", ...), else None."""
     if head[:6] in (b"GIF87a", b"GIF89a"):

@@ -42,6 +42,20 @@ def depth_png(counts: Any) -> bytes:
     return stream.getvalue()
 
 
+def depth_tiff(values: Any) -> bytes:
+    """Numbers [h, w] as a TIFF of one channel, of their type."""
+    stream = io.BytesIO()
+    PIL.Image.fromarray(np.asarray(values)).save(stream, "TIFF", compression="tiff_lzw")
+    return stream.getvalue()
+
+
+def depth_npy(values: Any, *, pickled: bool = False) -> bytes:
+    """An array as NumPy saves it."""
+    stream = io.BytesIO()
+    np.save(stream, values, allow_pickle=pickled)
+    return stream.getvalue()
+
+
 def depth_exr(values: Any, channel: str = "R", **more: Any) -> bytes:
     """Numbers [h, w] as an OpenEXR of half floats and ZIP, as Record3D writes it."""
     channels = {channel: np.asarray(values, np.float16), **more}

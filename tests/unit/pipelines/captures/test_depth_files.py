@@ -26,7 +26,14 @@ from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.sensor_depth import load_sensor_depth
 from pipelines.stages.ingest import run
 from tests.capture_writers import reduced, write_nerfstudio, write_polycam, write_record3d
-from tests.unit.pipelines.captures.archives import context, depth_exr, depth_png, write_zip
+from tests.unit.pipelines.captures.archives import (
+    context,
+    depth_exr,
+    depth_npy,
+    depth_png,
+    depth_tiff,
+    write_zip,
+)
 
 SIZE = (64, 48)
 
@@ -89,8 +96,73 @@ def test_writer_tells_what_it_refused_and_removes_an_empty_folder(tmp_path: Path
         writer.close()
         (told,) = writer.warnings
     assert "2 of 2 depth maps cannot be used" in told
-    assert '"a" is neither a PNG nor OpenEXR' in told
+    assert '"a" is neither a PNG, a TIFF, OpenEXR nor NumPy' in told
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("dtype", ["u2", ">u2", "i4", "i8", "f2", "f4", ">f8"])
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 1), (1, 48, 64)])
+def test_arrays_of_numpy_are_read_as_they_are(
+    tmp_path: Path, dtype: str, shape: tuple[int, ...]
+) -> None:
+    counts = np.random.default_rng(3).integers(0, 2000, (48, 64)).astype(dtype)
+    z = read(tmp_path, depth_npy(counts.reshape(shape)))
+    np.testing.assert_allclose(z, counts.astype(float) * 0.001, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32])
+def test_tiffs_of_one_channel_are_read(tmp_path: Path, dtype: type) -> None:
+    counts: np.ndarray = np.random.default_rng(3).integers(0, 60_000, (48, 64)).astype(dtype)
+    np.testing.assert_allclose(read(tmp_path, depth_tiff(counts)), counts * 0.001, rtol=1e-6)
+
+
+@pytest.mark.parametrize("channel", ["R", "Z", "Y", "V", "ViewLayer.Depth.Z", "Depth.V"])
+def test_openexr_has_its_depth_in_the_channel_that_its_writer_calls_so(
+    tmp_path: Path, channel: str
+) -> None:
+    values = np.full((48, 64), 1.5, np.float16)
+    np.testing.assert_allclose(read(tmp_path, depth_exr(values, channel)), 0.0015)
+    with pytest.raises(CaptureError, match="no channel R, Z, Y or V"):
+        read(tmp_path / "other", depth_exr(values, "Blue"))
+
+
+@pytest.mark.parametrize("write", [depth_npy, depth_tiff])
+def test_what_a_renderer_met_nothing_at_is_not_known(
+    tmp_path: Path, write: Callable[[Any], bytes]
+) -> None:
+    values = np.full((48, 64), 2.0, np.float32)
+    values[0, :3] = [65504.0, 1e10, np.inf]
+    assert (read(tmp_path, write(values)) > 0).sum() == values.size - 3
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (depth_npy(np.array([[{}]], object), pickled=True), "does not decode"),
+        (depth_npy(np.ones((48, 64, 3))), "not one for each pixel"),
+        (depth_npy(np.ones((48, 64), complex)), "not one for each pixel"),
+        (depth_npy(np.ones(48)), "not one for each pixel"),
+        (depth_npy(np.ones((48, 64), np.uint8)), "has 8 bits"),
+        (depth_npy(np.ones((480, 640), np.uint16)), "100000 are allowed"),
+        (depth_npy(np.ones((0, 64))), "64x0 pixels"),
+        (depth_npy(np.ones((48, 64)))[:-1], "does not decode"),
+        (depth_npy(np.ones((48, 64)))[:9], "does not decode"),
+        (b"\x93NUMPY\x09\x00" + bytes(100), "does not decode"),
+        (
+            depth_npy(np.ones((48, 64))).replace(
+                b"(48, 64), }" + b" " * 18, b"(48, 6" + b"0" * 20 + b"), "
+            ),
+            "does not decode",
+        ),
+        (depth_tiff(np.zeros((48, 64, 3), np.uint8)), "has colours"),
+        (depth_tiff(np.ones((48, 64), np.uint16))[:200], "does not decode"),
+    ],
+)
+def test_damage_and_other_arrays_are_refused_by_name(tmp_path: Path, data: bytes, why: str) -> None:
+    with pytest.raises(CaptureError, match=why) as caught:
+        read(tmp_path, data)
+    assert caught.value.code == "image_undecodable"
+    assert '"d"' in caught.value.message
 
 
 def _boxed(data: bytes, *box: int) -> bytes:
@@ -145,7 +217,11 @@ def _written(file: OpenEXR.File) -> bytes:
 
 @pytest.mark.parametrize(
     ("make", "why"),
-    [(_several_parts, "2 images"), (_tiled, "tiled"), (_of_integers, "no channel R of plain")],
+    [
+        (_several_parts, "2 images"),
+        (_tiled, "tiled"),
+        (_of_integers, "no channel R, Z, Y or V of plain"),
+    ],
 )
 def test_openexr_of_another_kind_is_refused(
     tmp_path: Path, make: Callable[[], bytes], why: str

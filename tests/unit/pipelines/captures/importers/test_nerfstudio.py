@@ -352,7 +352,7 @@ def test_depth_on_another_machine_is_matched_but_never_with_a_picture(tmp_path: 
 
 
 UNUSABLE = {
-    "is neither": b"\x93NUMPY" + bytes(60),
+    "is neither": b"a map of depth" + bytes(60),
     "does not decode": depth_png(COUNTS)[:90],
     "8 bits": depth_png(np.full((12, 16), 9, np.uint8)),
     "colours": picture(16, 12, kind="PNG"),
