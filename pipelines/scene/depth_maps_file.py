@@ -21,6 +21,9 @@ from pipelines.scene.depth_views import Pinhole
 
 INDEX = "maps.json"
 _FOLDER = "maps"
+_FARTHEST = 10_000.0
+"""Medians of a map. What is farther is unknown: where a plane goes to its horizon depth has no end,
+and the half precision of the files has, at 65,504."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,13 @@ class DepthMapsWriter:
         self._images: list[MappedImage] = []
 
     def append(self, file: str, lens: Pinhole, found: DepthMap, light: Light | None = None) -> None:
-        """The map of one more image. Half precision, relative to the map's median: 0.05 %."""
+        """The map of one more image. Half precision, relative to the map's median: 0.05 %, up to
+        `_FARTHEST` of it."""
         known = found.z > 0
         unit = float(np.median(found.z[known])) if known.any() else 1.0
         path = self._folder / _FOLDER / f"{len(self._images):06d}.npz"
-        relative = (found.z / np.float32(unit)).astype(np.float16)
+        relative = found.z / np.float32(unit)
+        relative = np.where(relative <= _FARTHEST, relative, 0.0).astype(np.float16)
         np.savez_compressed(path, z=relative, unit=np.float64(unit), votes=found.votes)
         self._images.append(MappedImage(file, lens, light))
 
