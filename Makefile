@@ -35,8 +35,10 @@ test: install-test ## Install what the tests need and run them all
 check: install-test ## Lint, types and import rules
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
-	@$(BIN)/mypy
-	@$(BIN)/python -m pytest -q tests/test_architecture.py tests/test_docs.py
+	@# Types on one core, import rules on another.
+	@$(BIN)/mypy & types=$$!; \
+	$(BIN)/python -m pytest -q tests/test_architecture.py tests/test_docs.py; rules=$$?; \
+	wait $$types && exit $$rules
 
 fix: install-test ## Format and mend what can be mended
 	@$(BIN)/ruff format .
