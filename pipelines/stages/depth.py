@@ -358,6 +358,7 @@ def _light(search: _Search, maps: MapShelf) -> tuple[list[Light | None], dict[st
         "largest_ratio": round(float((light.gains.max(axis=0) / light.gains.min(axis=0)).max()), 3),
         "bend": light.bend,
         "num_pairs": light.num_pairs,
+        "num_held": light.num_held,
     }
     if level:
         ctx.logger.info("the pictures are brought to one light: %s", told)

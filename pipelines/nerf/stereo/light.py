@@ -34,6 +34,10 @@ _MOST_POINTS, _MOST_SHARED, _MIN_SHARED = 3000, 500, 100
 _WITHIN = 0.02
 _COMPARING = 0.6
 _ROUNDS, _LEAST_ERROR, _HOLD = 12, 0.01, 1e-3
+_MOST_EXPOSED, _MOST_TINTED = 1.8, 0.4
+"""Logarithms, of a picture's gain and of a channel's beside the others', that are believed: two and
+a half stops either way, and half as much again in colour. What is seen through (a fence before the
+sky) changes its looks as a camera comes near, all pairs say the same, and it adds up on the way."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class CaptureLight:
     gains: [V, 3], with the geometric mean 1. bend: of the camera's curve. drift: the largest
     channel's standard deviation of the gains' logarithms. contradiction: by how much the median
     pair's ratio differs from that of its gains, a logarithm too. num_pairs: that were asked.
+    num_held: pictures whose gains would have been beyond reason.
     """
 
     gains: Floats
@@ -50,6 +55,7 @@ class CaptureLight:
     drift: float = 0.0
     contradiction: float = 0.0
     num_pairs: int = 0
+    num_held: int = 0
 
     @property
     def is_drifting(self) -> bool:
@@ -124,6 +130,7 @@ def _with_bend(
     found = offsets_between(which, ratios, num_views, trust)
     asked = np.unique(which)
     found[asked] -= found[asked].mean(axis=0)
+    wild, found = found, within_reason(found)
     told = found[which[:, 1]] - found[which[:, 0]]
     differences = [
         np.abs(exposed(pair.here, np.exp(step), bend) - pair.there).mean()
@@ -135,8 +142,19 @@ def _with_bend(
         float(found[asked].std(axis=0).max()),
         float(np.median(np.abs(ratios - told).max(axis=1))),
         len(shared),
+        int((np.abs(found - wild).max(axis=1) > 0.0).sum()),
     )
     return float(np.mean(differences)), light
+
+
+def within_reason(offsets: Floats) -> Floats:
+    """Logarithms of gains [V, 3], with no more than a camera does between pictures of one scene."""
+    exposure = offsets.mean(axis=1, keepdims=True)
+    tint = offsets - exposure
+    shrunk = _MOST_TINTED / np.maximum(np.abs(tint).max(axis=1, keepdims=True), _MOST_TINTED)
+    reasonable = np.clip(exposure, -_MOST_EXPOSED, _MOST_EXPOSED) + shrunk * tint
+    is_wild = (np.abs(exposure) > _MOST_EXPOSED) | (shrunk < 1.0)
+    return np.where(is_wild, reasonable, offsets)
 
 
 def offsets_between(

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from pipelines.nerf.data.light import exposed
-from pipelines.nerf.stereo.light import DRIFT, CaptureLight, find_light, offsets_between
+from pipelines.nerf.stereo.light import (
+    DRIFT,
+    CaptureLight,
+    find_light,
+    offsets_between,
+    within_reason,
+)
 from pipelines.nerf.stereo.views import StereoView
 from tests.unit.pipelines.nerf.stereo.painted_wall import look, row_of_cameras
 
@@ -99,6 +105,29 @@ def test_one_wrong_pair_does_not_move_the_others() -> None:
     differences[3] += 2.0
     found = offsets_between(pairs, differences, 5)
     assert found - found[0] == pytest.approx(values, abs=0.02)
+
+
+def test_no_picture_is_taken_in_a_light_that_no_camera_has() -> None:
+    """A look through a fence: the sky behind it is bluer than from elsewhere, all pairs say so."""
+    views, depths, pictures = scene()
+    gains = np.ones((COUNT, 3))
+    gains[-1] = [0.5, 1.0, 2.0]
+    lit = [exposed(picture, gain, 0.0) for picture, gain in zip(pictures, gains, strict=True)]
+    found = find_light(views, depths, [stored(picture) for picture in lit], NEIGHBOURS)
+    assert found.num_held == 1
+    told = np.log(found.gains)
+    assert np.abs(told - told.mean(axis=1, keepdims=True)).max() < 0.41
+
+
+def test_what_a_camera_does_is_believed_and_what_it_does_not_is_held() -> None:
+    believed = np.array([[1.7, 1.7, 1.7], [-1.1, -1.3, -1.2], [0.38, -0.35, 0.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(within_reason(believed), believed)
+    wild = within_reason(np.array([[2.0, 2.7, 3.2], [-4.0, -4.0, -4.0], [0.6, -0.6, 0.0]]))
+    assert wild[0].mean() == pytest.approx(1.8)
+    assert np.ptp(wild[0]) < 0.8
+    assert np.argsort(wild[0]).tolist() == [0, 1, 2]
+    assert wild[1] == pytest.approx([-1.8, -1.8, -1.8])
+    assert wild[2] == pytest.approx([0.4, -0.4, 0.0])
 
 
 def test_progress_moves_and_may_end_it() -> None:
