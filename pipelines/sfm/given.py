@@ -26,8 +26,8 @@ from pipelines.sfm.agreement import LITTLE
 from pipelines.sfm.given_depth import Beside
 from pipelines.sfm.given_fit import Fit, fit_of
 from pipelines.sfm.given_lenses import LensTrial, objection, with_lenses
-from pipelines.sfm.given_pairs import overlapping_pairs, sampled_pairs
-from pipelines.sfm.given_refinement import Refined, refine
+from pipelines.sfm.given_pairs import near_pairs, overlapping_pairs, sampled_pairs
+from pipelines.sfm.given_refinement import Refined, located, refine
 from pipelines.sfm.given_scale import Scale, scaled, weighed
 from pipelines.sfm.pairs import Pairs
 from pipelines.sfm.tracks import Floats, Observations, build_tracks
@@ -89,7 +89,8 @@ class Judged:
     sampled: the given poses' fit to a sample of pairs, None where too few match. before, after: of
     given and refined poses, by matches that were held out, where refinement got so far. refined:
     its result, whether it was taken or not. lens_trial: whether lenses were adjusted, too. why: in
-    words. seconds: of all.
+    words. located: points where poses that are trusted have them, if they were asked for. seconds:
+    of all.
     """
 
     mode: Mode
@@ -104,7 +105,13 @@ class Judged:
     depths: tuple[Beside, Beside] | None = None
     scale: Scale | None = None
     reading: str | None = None
+    located: Refined | None = None
     seconds: float = 0.0
+
+    @property
+    def found(self) -> Refined | None:
+        """The points that go with the poses that are handed on, where any were found."""
+        return self.refined if self.verdict == "refined" else self.located
 
     @property
     def depth_by_given_lens(self) -> bool:
@@ -124,7 +131,8 @@ class Judge:
 
     settings: of features. progress: receives the share that is done and a message; what it raises
     ends all. logger: receives what breaks off. beside: refined or given points beside measured
-    depth, see `pipelines.sfm.given_depth`.
+    depth, see `pipelines.sfm.given_depth`. locate: whether points are wanted also of poses that
+    stay as they are.
     """
 
     def __init__(
@@ -139,6 +147,7 @@ class Judge:
         num_threads: int,
         seed: int,
         logger: logging.Logger,
+        locate: bool = False,
     ) -> None:
         self._posed = posed
         self._reconstructor = reconstructor
@@ -149,6 +158,7 @@ class Judge:
         self._num_threads = num_threads
         self._seed = seed
         self._logger = logger
+        self._locate = locate
         self._looked: set[int] = set()
 
     def judge(self, mode: Mode, sent: Callable[[Floats], Floats]) -> Judged:
@@ -161,9 +171,11 @@ class Judge:
         judged = Judged(mode, "unverified", "", self._posed.poses)
         try:
             judged = self._verified(judged, sent)
+            deadline = began + _BASE_S + _PER_IMAGE_S * len(self._posed.files)
             if self._is_to_refine(judged):
-                deadline = began + _BASE_S + _PER_IMAGE_S * len(self._posed.files)
                 judged = self._refined(judged, deadline)
+            elif self._locate and judged.verdict == "trusted":
+                judged = replace(judged, located=self._located(deadline))
         except Cancelled:
             raise
         except OutOfTime:
@@ -261,6 +273,24 @@ class Judge:
             why=f"matches that were set aside miss the given poses by {before.error_px:.2f} px, "
             f"the refined ones by {judged.after.error_px:.2f}",
         )
+
+    def _located(self, deadline: float) -> Refined | None:
+        """What pictures show, where the given poses have it; None where that breaks off."""
+        posed = self._posed
+
+        def poll() -> None:
+            if time.monotonic() > deadline:
+                raise OutOfTime
+
+        try:
+            self._match(near_pairs(posed.poses), (0.3, 0.98), "looking for points", poll)
+            seen, _ = build_tracks(self._reconstructor.correspondences(), 0.0, self._seed)
+            return located(posed.poses, posed.lenses, seen, self._settings.max_image_px)
+        except Cancelled:
+            raise
+        except (OutOfTime, *_UNREFINED):
+            self._logger.warning("Looking for points broke off: there are none.", exc_info=True)
+            return None
 
     def _with_lenses(
         self, judged: Judged, seen: Observations, held: VerifiedMatches, poll: Callable[[], None]

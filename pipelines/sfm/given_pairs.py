@@ -26,6 +26,8 @@ _PARTNER = 0.5
 _RING_EDGES = (0.0, 0.2, 0.4, 0.7, 1.0, 1.4)
 _PER_RING = 3
 """Partners at each distance: near ones match best, far ones hold a path together."""
+_NEAR_RINGS = (0.2, 0.5)
+"""Partners by which points are found: far enough for rays to meet, near enough to match well."""
 _STEPS = (1, 2, 4)
 """Neighbours in the capture, whatever the poses say of them: those may be wrong."""
 
@@ -44,6 +46,21 @@ def sampled_pairs(poses: Floats) -> Pairs:
         later = np.where(np.abs(np.arange(num) - i) > num // 4, badness, np.inf)
         for j in {min(i + 1, num - 1), int(badness.argmin()), int(later.argmin())} - {i}:
             if badness[j] < np.inf and (j == i + 1 or badness[j] < np.log(3.0)):
+                pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
+
+
+def near_pairs(poses: Floats) -> Pairs:
+    """Pairs by which points are found under poses that are known: of each image neighbours in the
+    capture, and the nearest that is at least so far away, for each of two distances."""
+    num = len(poses)
+    pairs = {(i, i + step) for step in _STEPS for i in range(num - step)}
+    for i in range(num):
+        distances = apart(poses, i)
+        distances[i] = np.inf
+        for least in _NEAR_RINGS:
+            j = int(np.where(distances >= least, distances, np.inf).argmin())
+            if distances[j] <= _RING_EDGES[-1]:
                 pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)
 

@@ -87,11 +87,7 @@ def refine(
     goes down. long_side_px: at which features were found.
     """
     num = len(given)
-    rays = np.full((len(seen.track), 3), np.nan)
-    for image in np.unique(seen.image).tolist():
-        mine = seen.image == image
-        rays[mine] = rays_through(lenses[image], seen.xy[mine])
-    scales = np.array([px_scale([lens], long_side_px) for lens in lenses])
+    rays, scales = rays_of(lenses, seen), scales_of(lenses, long_side_px)
     full = [
         max(lens.width, lens.height) / min(long_side_px, max(lens.width, lens.height))
         for lens in lenses
@@ -144,6 +140,29 @@ def refine(
         is_anew=anew & told,
         before=before,
     )
+
+
+def located(
+    poses: Floats, lenses: Sequence[Intrinsics], seen: Observations, long_side_px: int
+) -> Refined:
+    """The poses as they are, with the points where they have the tracks `seen`."""
+    limits = LAST_PX / scales_of(lenses, long_side_px)
+    points, fits = triangulate(seen, rays_of(lenses, seen), poses, limits)
+    return as_found(poses, lenses, points, fits, seen)
+
+
+def rays_of(lenses: Sequence[Intrinsics], seen: Observations) -> Floats:
+    """[K, 3], unit vectors in camera axes; NaN where a lens shows nothing."""
+    rays = np.full((len(seen.track), 3), np.nan)
+    for image in np.unique(seen.image).tolist():
+        mine = seen.image == image
+        rays[mine] = rays_through(lenses[image], seen.xy[mine])
+    return rays
+
+
+def scales_of(lenses: Sequence[Intrinsics], long_side_px: int) -> Floats:
+    """[N], pixels of each image, at the size at which features were found, for an angle of 1."""
+    return np.array([px_scale([lens], long_side_px) for lens in lenses])
 
 
 def as_found(

@@ -1,9 +1,10 @@
 """Stage `poses` of a capture that brought its poses: they are verified, and refined where it helps.
 
 Writes cameras.json (the bytes of `ingest`, unless poses were refined), points.ply where there are
-points (those that came along; where poses were refined those that were found with them), and
-report.json (`given`: how well the poses fit, and what was done, see `pipelines.sfm.given`). World,
-scale and order stay those of `ingest`.
+points (those that came along; where poses were refined those that were found with them; where they
+are trusted and came alone those that matches have under them), and report.json (`given`: how well
+the poses fit, and what was done, see `pipelines.sfm.given`). World, scale and order stay those of
+`ingest`.
 """
 
 from __future__ import annotations
@@ -86,6 +87,8 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             num_threads=options.num_threads if options.num_threads > 0 else num_processors(),
             seed=ctx.seed,
             logger=ctx.logger,
+            # A sensor knows more of where surfaces are than features do.
+            locate=not (root / SPARSE_POINTS).is_file() and not all(depths),
         )
         judged = judge.judge(options.given, lambda poses: as_sent(poses, cameras.notes))
     ctx.logger.info("The given poses are %s: %s", judged.verdict, judged.why)
@@ -138,6 +141,8 @@ def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext
         for name in ("cameras.json", SPARSE_POINTS):
             if (root / name).is_file():
                 shutil.copyfile(root / name, ctx.out / name)
+        if judged.located is not None:
+            _write_points(judged.located, root, posed, ctx)
         return
     poses = opengl_from_opencv(judged.poses)
     lenses = list(cameras.cameras)
@@ -154,8 +159,13 @@ def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext
     notes = {**cameras.notes, "poses": "refined"}
     changed = replace(cameras, cameras=tuple(lenses), images=images, notes=notes)
     changed.save(ctx.out / "cameras.json")
-    apart = apart_deg(refined.seen, refined.points, refined.poses)
-    kept = np.flatnonzero((refined.track_lengths >= MIN_TRACK) & (apart >= MIN_APART_DEG))
+    _write_points(refined, root, posed, ctx)
+
+
+def _write_points(found: Refined, root: Path, posed: Posed, ctx: StageContext) -> None:
+    """points.ply of what is seen by enough images, from far enough apart."""
+    apart = apart_deg(found.seen, found.points, found.poses)
+    kept = np.flatnonzero((found.track_lengths >= MIN_TRACK) & (apart >= MIN_APART_DEG))
     if len(kept):
-        colors = colors_of(refined, [root / file for file in posed.files], kept)
-        write_points(ctx.out / SPARSE_POINTS, refined.points[kept].astype(np.float32), colors)
+        colors = colors_of(found, [root / file for file in posed.files], kept)
+        write_points(ctx.out / SPARSE_POINTS, found.points[kept].astype(np.float32), colors)

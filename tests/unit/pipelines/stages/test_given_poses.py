@@ -13,6 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from pipelines.errors import Cancelled, ToolError
+from pipelines.exports.formats.ply import read_ply, write_points
 from pipelines.options import PosesOptions
 from pipelines.sample.align import path_extent, similarity
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
@@ -135,6 +136,57 @@ def test_exact_poses_are_trusted_and_stay_as_they_are(
     assert summary["given"]["refinement"] is None
     assert_as_given(ctx)
     assert json.loads((ctx.out / "report.json").read_text()) == summary
+
+
+def test_trusted_poses_that_came_without_points_get_those_that_pictures_show(
+    tmp_path: Path, pictures: list[Image.Image]
+) -> None:
+    """Depth is sought where they are: of a long walk few probes would find little."""
+    ctx = context(tmp_path / "job", TRUTH, pictures)
+    summary = run(OPTIONS, ctx)
+    assert summary["given"]["verdict"] == "trusted"
+    assert_as_given(ctx)
+    points = read_ply(ctx.out / "points.ply")
+    assert len(points.points) > 300
+    assert points.colors is not None
+    assert points.colors.std() > 5.0
+    # The room is three planes through the origin.
+    off = np.abs(points.points).min(axis=1)
+    assert np.median(off) < 0.002 * EXTENT
+    assert np.percentile(off, 95) < 0.02 * EXTENT
+    for pose in TRUTH:
+        local = (points.points - pose[:, 3]) @ pose[:, :3]
+        at = FOCAL * local[:, :2] / -local[:, 2:]
+        inside = (local[:, 2] < 0) & (np.abs(at) < (WIDTH / 2, HEIGHT / 2)).all(axis=1)
+        assert inside.sum() > 50, "each picture shows some"
+
+
+def test_what_brings_points_or_depth_is_not_searched_for_more(
+    tmp_path: Path, pictures: list[Image.Image]
+) -> None:
+    ctx = context(tmp_path / "sensor", TRUTH, pictures, depth=1.0)
+    assert run(OPTIONS, ctx)["given"]["verdict"] == "trusted"
+    assert not (ctx.out / "points.ply").exists()
+    ctx = context(tmp_path / "points", TRUTH, pictures)
+    brought = np.random.default_rng(1).uniform(0, 1, (50, 3)).astype(np.float32)
+    path = ctx.workspace.stage("ingest") / "points.ply"
+    write_points(path, brought, np.zeros((50, 3), np.uint8))
+    run(OPTIONS, ctx)
+    assert (ctx.out / "points.ply").read_bytes() == path.read_bytes()
+
+
+def test_poses_are_trusted_all_the_same_where_looking_for_points_breaks_off(
+    tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*args: Any) -> None:
+        raise ToolError("no", code="no", hint="")
+
+    monkeypatch.setattr(given, "located", broken)
+    ctx = context(tmp_path, TRUTH, pictures)
+    summary = run(OPTIONS, ctx)
+    assert summary["given"]["verdict"] == "trusted"
+    assert "exact poses" in summary["given"]["why"]
+    assert not (ctx.out / "points.ply").exists()
 
 
 def test_drifted_poses_are_refined_towards_the_truth_at_their_own_place_and_scale(
