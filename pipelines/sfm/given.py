@@ -109,11 +109,6 @@ class Judged:
     seconds: float = 0.0
 
     @property
-    def found(self) -> Refined | None:
-        """The points that go with the poses that are handed on, where any were found."""
-        return self.refined if self.verdict == "refined" else self.located
-
-    @property
     def depth_by_given_lens(self) -> bool:
         """Whether the sensor's depth is what the lens shows that came along, not the new one."""
         return self.depths is not None and self.depths[1].shown_by == "given"

@@ -39,6 +39,9 @@ MIN_TRACK = 3
 MIN_APART_DEG = 0.75
 """And points seen from nearly one direction (`apart_deg`): their distance is not known. COLMAP's
 1.5 degrees between two rays."""
+LEAST_SHOWN = 50
+"""Points of the median image below which trusted poses get none: what stereo finds by itself in
+small pictures then says more of where surfaces are."""
 MOST_FEATURES = 4096
 """Of an image: more say nothing more of its pose, and matching grows with their square."""
 
@@ -142,7 +145,7 @@ def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext
             if (root / name).is_file():
                 shutil.copyfile(root / name, ctx.out / name)
         if judged.located is not None:
-            _write_points(judged.located, root, posed, ctx)
+            _write_points(judged.located, root, posed, ctx, least_shown=LEAST_SHOWN)
         return
     poses = opengl_from_opencv(judged.poses)
     lenses = list(cameras.cameras)
@@ -162,10 +165,15 @@ def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext
     _write_points(refined, root, posed, ctx)
 
 
-def _write_points(found: Refined, root: Path, posed: Posed, ctx: StageContext) -> None:
-    """points.ply of what is seen by enough images, from far enough apart."""
+def _write_points(
+    found: Refined, root: Path, posed: Posed, ctx: StageContext, *, least_shown: int = 0
+) -> None:
+    """points.ply of what is seen by enough images, from far enough apart; of none where the median
+    image shows fewer than `least_shown`."""
     apart = apart_deg(found.seen, found.points, found.poses)
-    kept = np.flatnonzero((found.track_lengths >= MIN_TRACK) & (apart >= MIN_APART_DEG))
-    if len(kept):
+    is_kept = (found.track_lengths >= MIN_TRACK) & (apart >= MIN_APART_DEG)
+    shown = np.bincount(found.seen.image[is_kept[found.seen.track]], minlength=len(posed.files))
+    kept = np.flatnonzero(is_kept)
+    if len(kept) and np.median(shown) >= least_shown:
         colors = colors_of(found, [root / file for file in posed.files], kept)
         write_points(ctx.out / SPARSE_POINTS, found.points[kept].astype(np.float32), colors)

@@ -21,6 +21,7 @@ from pipelines.scene.sensor_depth import save_sensor_depth
 from pipelines.sfm import given
 from pipelines.sfm.given_depth import Beside
 from pipelines.stage import StageContext
+from pipelines.stages import given_poses
 from pipelines.stages.poses import run
 from pipelines.tools.colmap import Reconstructor
 from pipelines.workspace import Workspace
@@ -173,6 +174,16 @@ def test_what_brings_points_or_depth_is_not_searched_for_more(
     write_points(path, brought, np.zeros((50, 3), np.uint8))
     run(OPTIONS, ctx)
     assert (ctx.out / "points.ply").read_bytes() == path.read_bytes()
+
+
+def test_few_points_are_worse_than_none(
+    tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plain thing with a label: depth would be sought where the label is."""
+    monkeypatch.setattr(given_poses, "LEAST_SHOWN", 100_000)
+    ctx = context(tmp_path, TRUTH, pictures)
+    assert run(OPTIONS, ctx)["given"]["verdict"] == "trusted"
+    assert not (ctx.out / "points.ply").exists()
 
 
 def test_poses_are_trusted_all_the_same_where_looking_for_points_breaks_off(
