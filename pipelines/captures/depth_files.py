@@ -8,9 +8,11 @@ map that cannot be used never costs its picture: it is left out and told.
 
 from __future__ import annotations
 
+import ast
+import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -30,25 +32,15 @@ _ASPECT_SLACK = 0.02
 _MOST_CHANNELS = 4
 _ONE_CHANNEL = ("L", "I", "I;16", "I;16L", "I;16B", "I;16N", "F")
 """Pillow's modes of pictures with one channel of numbers, of 8 bits or more."""
-_EXR_CHANNELS = ("R", "Z", "Y", "V")
-"""Of OpenEXR, the first that is there: what apps, renderers, OpenCV and Blender write depth in, the
-latter with a layer's name before a dot."""
-_NO_CHANNEL = "has no channel R, Z, Y or V of plain numbers"
-_NOTHING_THERE = 65504.0
-"""Where numbers with a fraction are no less, nothing was met: the largest that 16 bits hold, or
-what renderers write in its place (1e10)."""
-_BAD_ARRAY = (
-    ValueError,
-    TypeError,
-    OverflowError,
-    EOFError,
-    SyntaxError,
-    TokenError,
-    RecursionError,
-    MemoryError,
-    OSError,
-)
-"""What NumPy raises for a damaged array: its header is read as Python's literals are."""
+_NO_CHANNEL = "has no channel Z, V, R or Y of plain numbers that must be its depth"
+_NOTHING_THERE = 1e9
+"""Numbers with a fraction from which on nothing was met: renderers write 1e10 there. So it is for
+65504, the largest that 16 bits hold of such numbers, as what was kept in them has it there."""
+_NPY_NUMBERS = re.compile(r"[<>|=]?(?:[ui][1248]|f[248])")
+"""What types of NumPy's arrays are read. Others never reach NumPy, which some of them end the
+process of: files may say anything."""
+_MOST_NPY_HEADER = 10_000
+_BAD_LITERAL = (ValueError, TypeError, SyntaxError, MemoryError, RecursionError)
 
 
 class DepthWriter:
@@ -60,7 +52,7 @@ class DepthWriter:
         self._max_pixels = max_pixels
         self._raw = out / ".raw_depth"
         self._num_tried = 0
-        self._refused: dict[str, CaptureError] = {}
+        self._refused: dict[str, str] = {}
         (out / _FOLDER).mkdir(parents=True, exist_ok=True)
 
     def close(self) -> None:
@@ -81,7 +73,7 @@ class DepthWriter:
         except CaptureError as error:
             if error.code != "image_undecodable":
                 raise
-            self._refused[depth.name] = error
+            self._refused[depth.name] = error.message  # not with the frames that hold the map
             self._archive.told(depth.files)
             return None
         file = f"{_FOLDER}/{number:05d}.npz"
@@ -115,7 +107,7 @@ class DepthWriter:
         """What is to be told about the maps so far."""
         if not self._refused:
             return []
-        first = next(iter(self._refused.values())).message
+        first = next(iter(self._refused.values()))
         return [
             f"{len(self._refused)} of {self._num_tried} depth maps cannot be used, and their "
             f"pictures are used without: {some_of(self._refused)}. {first}"
@@ -162,7 +154,7 @@ def _at_its_end(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Where counts are the largest that their type has: nothing was measured, or more than fits."""
     ends: NDArray[np.bool_]
     if values.dtype.kind == "f":
-        ends = values >= _NOTHING_THERE
+        ends = (values >= _NOTHING_THERE) | (values == np.finfo(np.float16).max)
     elif values.dtype.kind == "u":
         ends = values == np.iinfo(values.dtype).max
     else:
@@ -171,28 +163,39 @@ def _at_its_end(values: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _npy_array(path: Path, name: str, max_pixels: int) -> NDArray[Any]:
-    """An array of NumPy's, [h, w], or with one channel. Nothing that would have to be executed.
-
-    The file is mapped first, so that a header that promises more than there is takes no memory.
+    """An array of NumPy's, [h, w], or with one channel: plain numbers, and nothing that would have
+    to be executed. Source: numpy.lib.format, versions 1 to 3.
     """
+    with path.open("rb") as file:
+        version = int.from_bytes(file.read(8)[6:7], "little")
+        length = int.from_bytes(file.read(2 if version == 1 else 4), "little")
+        if version not in (1, 2, 3) or length > _MOST_NPY_HEADER:
+            raise _unusable(name, "does not decode")
+        written = file.read(length)
+        start = file.tell()
+        size = file.seek(0, os.SEEK_END)
     try:
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-    except _BAD_ARRAY as error:
-        if isinstance(error, OSError) and error.errno is not None:
-            raise  # the disk's fault, not the file's
+        told = ast.literal_eval(written.decode("latin1" if version < 3 else "utf8").strip())
+        kind, shape, is_fortran = told["descr"], told["shape"], told["fortran_order"]
+    except (*_BAD_LITERAL, LookupError) as error:
         raise _unusable(name, "does not decode") from error
-    rows = [length for length in mapped.shape if length != 1]
-    if len(rows) != 2 or mapped.dtype.kind not in "uif":
-        raise _unusable(
-            name, f"has {mapped.shape} values of {mapped.dtype}, not one for each pixel"
-        )
-    if not 0 < mapped.size <= max_pixels:
+    if not (isinstance(shape, tuple) and all(type(side) is int and side >= 0 for side in shape)):
+        raise _unusable(name, "does not decode")
+    rows = [side for side in shape if side != 1]
+    if not (isinstance(kind, str) and _NPY_NUMBERS.fullmatch(kind) and len(rows) == 2):
+        what = shown(f"{shape} values of {kind}")
+        raise _unusable(name, f"has {what}, not one number for each pixel")
+    count = rows[0] * rows[1]
+    if not 0 < count <= max_pixels:
         raise _unusable(name, f"has {rows[1]}x{rows[0]} pixels; {max_pixels} are allowed")
-    return np.array(mapped.reshape(rows))
+    if start + count * np.dtype(kind).itemsize > size:
+        raise _unusable(name, "does not decode")
+    values = np.fromfile(path, kind, count, offset=start)
+    return values.reshape(rows, order="F" if is_fortran is True else "C")
 
 
 def _exr_channel(path: Path, name: str, max_pixels: int) -> NDArray[Any]:
-    """The depth of an OpenEXR file, [h, w]: the first of `_EXR_CHANNELS` that it has.
+    """The depth of an OpenEXR file, [h, w].
 
     The headers are looked at before any pixel: size, one plain image, few channels. A damaged part
     is left out by the library, with a line on stdout, and no part is left then.
@@ -207,20 +210,46 @@ def _exr_channel(path: Path, name: str, max_pixels: int) -> NDArray[Any]:
         # Without `separate_channels` R, G and B would come as one array.
         with OpenEXR.File(str(path), separate_channels=True, num_threads=0) as file:
             channels = file.channels()
-            pixels = np.array(channels[_depth_channel(channels)].pixels)
+            depth = _depth_channel(channels)
+            pixels = np.array(channels[depth].pixels)
+            green = channels.get(f"{depth[:-1]}G") if depth.endswith("R") else None
+            has_colors = green is not None and not np.array_equal(
+                green.pixels, pixels, equal_nan=True
+            )
     except (RuntimeError, ValueError, TypeError, LookupError, OSError, OpenEXR.error) as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise  # the disk's fault, not the file's
         raise _unusable(name, "does not decode") from error
+    if has_colors:
+        raise _unusable(name, "has colours in place of one channel")
     if pixels.ndim != 2 or pixels.dtype.kind != "f":
         raise _unusable(name, _NO_CHANNEL)
     return pixels
 
 
 def _depth_channel(names: Iterable[str]) -> str:
-    """Which of an OpenEXR's channels holds depth; "" for none."""
-    found = {name.rsplit(".", 1)[-1]: name for name in names}
-    return next((found[channel] for channel in _EXR_CHANNELS if channel in found), "")
+    """Which of an OpenEXR's channels holds depth; "" for none, or where it may be one of several.
+
+    Renderers and Blender call it Z or V, apps R, OpenCV Y; a layer's name may stand before a dot.
+    Beside X and Y, Z is a direction's; beside others, V and Y are colours'.
+    """
+    layers: dict[str, set[str]] = {}
+    for name in names:
+        layer, _, channel = name.rpartition(".")
+        layers.setdefault(layer, set()).add(channel)
+    called, colors = [], []
+    for layer, channels in layers.items():
+        before = f"{layer}." if layer else ""
+        if "Z" in channels and not channels & {"X", "Y"}:
+            called.append(f"{before}Z")
+        elif channels == {"V"}:
+            called.append(f"{before}V")
+        elif "R" in channels:
+            colors.append(f"{before}R")
+        elif channels == {"Y"}:
+            colors.append(f"{before}Y")
+    found = called or colors
+    return found[0] if len(found) == 1 else ""
 
 
 def _exr_fault(parts: list[Any], max_pixels: int) -> str:

@@ -48,7 +48,7 @@ class DepthMapsWriter:
     def append(self, file: str, lens: Pinhole, found: DepthMap, light: Light | None = None) -> None:
         """The map of one more image. Half precision, relative to the map's median: 0.05 %, up to
         `_FARTHEST` of it."""
-        known = found.z > 0
+        known = np.isfinite(found.z) & (found.z > 0)
         unit = float(np.median(found.z[known])) if known.any() else 1.0
         path = self._folder / _FOLDER / f"{len(self._images):06d}.npz"
         relative = found.z / np.float32(unit)

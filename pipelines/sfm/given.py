@@ -62,6 +62,8 @@ _USUAL = 0.6
 """And that of the median image from which this can be told from drift."""
 _BASE_S, _PER_IMAGE_S = 300.0, 5.0
 """Seconds after which refinement gives up: many times what it takes on a machine of two cores."""
+_LOCATING_S, _LOCATING_PER_IMAGE_S, _MOST_LOCATING_S = 60.0, 1.0, 1800.0
+"""And the search for points under poses that are trusted: depth can do without them."""
 
 _UNREFINED = (PipelineError, ArithmeticError, MemoryError, OSError, RuntimeError, ValueError)
 """What may go wrong in a refinement without harm to the job: the log has it in full."""
@@ -166,11 +168,11 @@ class Judge:
         judged = Judged(mode, "unverified", "", self._posed.poses)
         try:
             judged = self._verified(judged, sent)
-            deadline = began + _BASE_S + _PER_IMAGE_S * len(self._posed.files)
             if self._is_to_refine(judged):
+                deadline = began + _BASE_S + _PER_IMAGE_S * len(self._posed.files)
                 judged = self._refined(judged, deadline)
             elif self._locate and judged.verdict == "trusted":
-                judged = replace(judged, located=self._located(deadline))
+                judged = replace(judged, located=self._located())
         except Cancelled:
             raise
         except OutOfTime:
@@ -269,9 +271,11 @@ class Judge:
             f"the refined ones by {judged.after.error_px:.2f}",
         )
 
-    def _located(self, deadline: float) -> Refined | None:
+    def _located(self) -> Refined | None:
         """What pictures show, where the given poses have it; None where that breaks off."""
         posed = self._posed
+        usual = _LOCATING_S + _LOCATING_PER_IMAGE_S * len(posed.files)
+        deadline = time.monotonic() + min(usual, _MOST_LOCATING_S)
 
         def poll() -> None:
             if time.monotonic() > deadline:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,15 @@ from pipelines.sfm.given_refinement import Refined
 from pipelines.sfm.tracks import Integers
 
 
-def colors_of(found: Refined, pictures: Sequence[Path], points: Integers) -> npt.NDArray[np.uint8]:
+def colors_of(
+    found: Refined,
+    pictures: Sequence[Path],
+    points: Integers,
+    poll: Callable[[], None] = lambda: None,
+) -> npt.NDArray[np.uint8]:
     """The colour of each of `points` [P] in the first picture that shows it, uint8 [P, 3].
 
-    pictures: N, by the number of the image.
+    pictures: N, by the number of the image. poll: called before each is opened; may raise.
     """
     row_of = np.full(len(found.points), -1)
     row_of[points] = np.arange(len(points))
@@ -25,6 +30,7 @@ def colors_of(found: Refined, pictures: Sequence[Path], points: Integers) -> npt
     first = wanted[first]
     colors = np.full((len(points), 3), 128, np.uint8)
     for image in np.unique(found.seen.image[first]).tolist():
+        poll()
         mine = first[found.seen.image[first] == image]
         with Image.open(pictures[image]) as opened:
             shown = np.asarray(opened.convert("RGB"))

@@ -91,7 +91,7 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             seed=ctx.seed,
             logger=ctx.logger,
             # A sensor knows more of where surfaces are than features do.
-            locate=not (root / SPARSE_POINTS).is_file() and not all(depths),
+            locate=not (root / SPARSE_POINTS).is_file() and not any(depths),
         )
         judged = judge.judge(options.given, lambda poses: as_sent(poses, cameras.notes))
     ctx.logger.info("The given poses are %s: %s", judged.verdict, judged.why)
@@ -145,7 +145,11 @@ def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext
             if (root / name).is_file():
                 shutil.copyfile(root / name, ctx.out / name)
         if judged.located is not None:
-            _write_points(judged.located, root, posed, ctx, least_shown=LEAST_SHOWN)
+            try:
+                _write_points(judged.located, root, posed, ctx, least_shown=LEAST_SHOWN)
+            except (MemoryError, OSError):
+                ctx.logger.warning("The points that were found are left out.", exc_info=True)
+                (ctx.out / SPARSE_POINTS).unlink(missing_ok=True)
         return
     poses = opengl_from_opencv(judged.poses)
     lenses = list(cameras.cameras)
@@ -175,5 +179,6 @@ def _write_points(
     shown = np.bincount(found.seen.image[is_kept[found.seen.track]], minlength=len(posed.files))
     kept = np.flatnonzero(is_kept)
     if len(kept) and np.median(shown) >= least_shown:
-        colors = colors_of(found, [root / file for file in posed.files], kept)
+        pictures = [root / file for file in posed.files]
+        colors = colors_of(found, pictures, kept, ctx.check_cancelled)
         write_points(ctx.out / SPARSE_POINTS, found.points[kept].astype(np.float32), colors)

@@ -129,8 +129,12 @@ def _with_bend(
     trust = np.array([min(1.0, len(pair.here) / _MOST_SHARED) for pair in shared])
     found = offsets_between(which, ratios, num_views, trust)
     asked = np.unique(which)
+    # About what is usual, not about a mean that the wild ones have a part in.
+    found[asked] -= np.median(found[asked], axis=0)
+    wild = found[asked]
+    found[asked] = within_reason(wild)
+    num_held = int((found[asked] != wild).any(axis=1).sum())
     found[asked] -= found[asked].mean(axis=0)
-    wild, found = found, within_reason(found)
     told = found[which[:, 1]] - found[which[:, 0]]
     differences = [
         np.abs(exposed(pair.here, np.exp(step), bend) - pair.there).mean()
@@ -142,13 +146,14 @@ def _with_bend(
         float(found[asked].std(axis=0).max()),
         float(np.median(np.abs(ratios - told).max(axis=1))),
         len(shared),
-        int((np.abs(found - wild).max(axis=1) > 0.0).sum()),
+        num_held,
     )
     return float(np.mean(differences)), light
 
 
 def within_reason(offsets: Floats) -> Floats:
-    """Logarithms of gains [V, 3], with no more than a camera does between pictures of one scene."""
+    """Logarithms of gains [V, 3] about the usual ones, with no more than a camera does between
+    pictures of one scene."""
     exposure = offsets.mean(axis=1, keepdims=True)
     tint = offsets - exposure
     shrunk = _MOST_TINTED / np.maximum(np.abs(tint).max(axis=1, keepdims=True), _MOST_TINTED)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import random
 import struct
+import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -122,8 +123,103 @@ def test_openexr_has_its_depth_in_the_channel_that_its_writer_calls_so(
 ) -> None:
     values = np.full((48, 64), 1.5, np.float16)
     np.testing.assert_allclose(read(tmp_path, depth_exr(values, channel)), 0.0015)
-    with pytest.raises(CaptureError, match="no channel R, Z, Y or V"):
+    with pytest.raises(CaptureError, match="no channel Z, V, R or Y"):
         read(tmp_path / "other", depth_exr(values, "Blue"))
+
+
+DEEP, COLORS = np.full((48, 64), 3.0, np.float16), np.full((48, 64), 0.2, np.float16)
+
+
+def test_depth_beside_colours_and_normals_is_the_depth_or_is_refused(tmp_path: Path) -> None:
+    for number, channels in enumerate(
+        (
+            {"R": COLORS, "G": COLORS, "B": COLORS, "Z": DEEP},
+            {"Combined.R": COLORS, "Combined.G": 2 * COLORS, "Depth.Z": DEEP},
+            {"Depth.Z": DEEP, "Normal.X": COLORS, "Normal.Y": COLORS, "Normal.Z": -COLORS},
+            {"R": DEEP, "G": DEEP, "B": DEEP},  # one number, as a picture
+        )
+    ):
+        (first, values), *more = channels.items()
+        z = read(tmp_path / f"read{number}", depth_exr(values, first, **dict(more)))
+        np.testing.assert_allclose(z, 0.003, rtol=1e-3)
+    for number, (channels, why) in enumerate(
+        (
+            ({"X": COLORS, "Y": COLORS, "Z": COLORS}, "no channel Z"),
+            ({"A.Z": DEEP, "B.Z": COLORS}, "no channel Z"),
+            ({"R": COLORS, "G": 2 * COLORS, "B": COLORS}, "has colours"),
+        )
+    ):
+        (first, values), *more = channels.items()
+        with pytest.raises(CaptureError, match=why):
+            read(tmp_path / f"refused{number}", depth_exr(values, first, **dict(more)))
+
+
+def npy_saying(header: str, version: int = 1) -> bytes:
+    """An array's bytes behind any header."""
+    size = len(header).to_bytes(2 if version == 1 else 4, "little")
+    return b"\x93NUMPY" + bytes([version, 0]) + size + header.encode("latin1") + bytes(48 * 64 * 8)
+
+
+@pytest.mark.parametrize(
+    "descr",
+    [
+        "'<m8[s/0]'",
+        "'<M8[s/0]'",
+        "()",
+        "('<f4',)",
+        "[('a', '<f4')]",
+        "'<f4', 'descr': '<m8[s/0]'",
+        "'|O'",
+        "'<f16'",
+        "7",
+        "None",
+    ],
+)
+def test_no_array_of_another_kind_ends_the_process(tmp_path: Path, descr: str) -> None:
+    """NumPy divides by zero in C for the first ones."""
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': (48, 64), }}"
+    for version in (1, 2, 3):
+        with pytest.raises(CaptureError, match="not one number for each pixel"):
+            read(tmp_path / str(version), npy_saying(header, version))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (48, -64)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (48, True)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': 64}",
+        "{'descr': '<f4', 'shape': (48, 64)}",
+        "(" * 5000,
+        "__import__('os')",
+        "[1, 2]",
+        "",
+    ],
+)
+def test_headers_that_make_no_sense_are_refused(tmp_path: Path, header: str) -> None:
+    with pytest.raises(CaptureError, match="does not decode"):
+        read(tmp_path, npy_saying(header))
+
+
+def test_arrays_by_columns_stand_as_they_are(tmp_path: Path) -> None:
+    values = np.arange(1, 48 * 64 + 1, dtype=np.float32).reshape(48, 64)
+    z = read(tmp_path, depth_npy(np.asfortranarray(values)))
+    np.testing.assert_allclose(z, 0.001 * values, rtol=1e-6)
+
+
+def test_what_was_refused_is_not_held(tmp_path: Path) -> None:
+    """Hundreds of maps of another aspect were kept by the errors' frames, with their files."""
+    wrong = depth_npy(np.ones((64, 64), np.float32))
+    with writer_of(tmp_path, **{f"d{number}": wrong for number in range(40)}) as writer:
+        tracemalloc.start()
+        try:
+            for number in range(40):
+                assert writer.store(SensorDepth(f"d{number}", 1.0), number, SIZE) is None
+            held, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert held < 10 * 64 * 64 * 4
+        assert isinstance(writer.warnings[0], str)
 
 
 @pytest.mark.parametrize("write", [depth_npy, depth_tiff])
@@ -131,22 +227,23 @@ def test_what_a_renderer_met_nothing_at_is_not_known(
     tmp_path: Path, write: Callable[[Any], bytes]
 ) -> None:
     values = np.full((48, 64), 2.0, np.float32)
-    values[0, :3] = [65504.0, 1e10, np.inf]
+    values[0, :5] = [65504.0, 1e10, np.inf, 70_000.0, 65_000.0]
     assert (read(tmp_path, write(values)) > 0).sum() == values.size - 3
 
 
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (depth_npy(np.array([[{}]], object), pickled=True), "does not decode"),
-        (depth_npy(np.ones((48, 64, 3))), "not one for each pixel"),
-        (depth_npy(np.ones((48, 64), complex)), "not one for each pixel"),
-        (depth_npy(np.ones(48)), "not one for each pixel"),
+        (depth_npy(np.array([[{}]], object), pickled=True), "not one number for each pixel"),
+        (depth_npy(np.ones((48, 64, 3))), "not one number for each pixel"),
+        (depth_npy(np.ones((48, 64), complex)), "not one number for each pixel"),
+        (depth_npy(np.ones(48)), "not one number for each pixel"),
         (depth_npy(np.ones((48, 64), np.uint8)), "has 8 bits"),
         (depth_npy(np.ones((480, 640), np.uint16)), "100000 are allowed"),
         (depth_npy(np.ones((0, 64))), "64x0 pixels"),
         (depth_npy(np.ones((48, 64)))[:-1], "does not decode"),
         (depth_npy(np.ones((48, 64)))[:9], "does not decode"),
+        (depth_npy(np.ones((48, 64)))[:6], "does not decode"),
         (b"\x93NUMPY\x09\x00" + bytes(100), "does not decode"),
         (
             depth_npy(np.ones((48, 64))).replace(
@@ -220,7 +317,7 @@ def _written(file: OpenEXR.File) -> bytes:
     [
         (_several_parts, "2 images"),
         (_tiled, "tiled"),
-        (_of_integers, "no channel R, Z, Y or V of plain"),
+        (_of_integers, "no channel Z, V, R or Y of plain"),
     ],
 )
 def test_openexr_of_another_kind_is_refused(

@@ -40,3 +40,7 @@ def test_what_is_ten_thousand_times_as_far_as_the_rest_is_unknown_and_never_infi
     assert np.isfinite(found).all()
     assert list(found[0] > 0.0) == [True, True, False, False, False, False, False, True]
     np.testing.assert_allclose(found[1:], 3.0, rtol=5e-4)
+    z[:5] = np.inf
+    found = kept(tmp_path / "mostly", z)
+    assert (found[:5] == 0.0).all()
+    np.testing.assert_allclose(found[5:], 3.0, rtol=5e-4)

@@ -168,6 +168,13 @@ def test_what_brings_points_or_depth_is_not_searched_for_more(
     ctx = context(tmp_path / "sensor", TRUTH, pictures, depth=1.0)
     assert run(OPTIONS, ctx)["given"]["verdict"] == "trusted"
     assert not (ctx.out / "points.ply").exists()
+    ctx = context(tmp_path / "most", TRUTH, pictures, depth=1.0)
+    cameras = CamerasFile.load(ctx.workspace.stage("ingest") / "cameras.json")
+    lost = replace(cameras.images[3], depth=None)
+    images = (*cameras.images[:3], lost, *cameras.images[4:])
+    replace(cameras, images=images).save(ctx.workspace.stage("ingest") / "cameras.json")
+    run(OPTIONS, ctx)
+    assert not (ctx.out / "points.ply").exists(), "one map that is missing changes nothing"
     ctx = context(tmp_path / "points", TRUTH, pictures)
     brought = np.random.default_rng(1).uniform(0, 1, (50, 3)).astype(np.float32)
     path = ctx.workspace.stage("ingest") / "points.ply"
@@ -197,6 +204,18 @@ def test_poses_are_trusted_all_the_same_where_looking_for_points_breaks_off(
     summary = run(OPTIONS, ctx)
     assert summary["given"]["verdict"] == "trusted"
     assert "exact poses" in summary["given"]["why"]
+    assert not (ctx.out / "points.ply").exists()
+
+
+def test_points_that_cannot_be_written_cost_no_job(
+    tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*args: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(given_poses, "write_points", full)
+    ctx = context(tmp_path, TRUTH, pictures)
+    assert run(OPTIONS, ctx)["given"]["verdict"] == "trusted"
     assert not (ctx.out / "points.ply").exists()
 
 

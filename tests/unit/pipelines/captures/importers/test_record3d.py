@@ -126,8 +126,8 @@ HALVES = np.ones((12, 16), np.float16)
     [
         ("exr", "is neither a PNG, a TIFF, OpenEXR nor NumPy"),
         (depth_exr(HALVES)[:200], "does not decode"),
-        (depth_exr(HALVES, channel="G"), "no channel R"),
-        (depth_exr(HALVES, A=HALVES, B=HALVES, G=HALVES, Z=HALVES), "no channel R"),
+        (depth_exr(HALVES, channel="G"), "no channel Z, V, R"),
+        (depth_exr(HALVES, A=HALVES, B=HALVES, G=HALVES, Z=HALVES), "no channel Z, V, R"),
         (depth_exr(HALVES.T), "not the same view"),
         (depth_exr(HALVES * 0), "can be trusted"),
         (depth_exr(np.ones((1200, 1600), np.float16)), "1600x1200 pixels; 1000000 are allowed"),

@@ -116,7 +116,11 @@ def test_no_picture_is_taken_in_a_light_that_no_camera_has() -> None:
     found = find_light(views, depths, [stored(picture) for picture in lit], NEIGHBOURS)
     assert found.num_held == 1
     told = np.log(found.gains)
-    assert np.abs(told - told.mean(axis=1, keepdims=True)).max() < 0.41
+    assert np.abs(told - told.mean(axis=1, keepdims=True)).max() < 0.5
+    usual = told[:-1]
+    assert np.ptp(usual, axis=0).max() < 0.03
+    assert np.ptp(usual.mean(axis=0)) < 0.2, "the others keep their colour"
+    assert told.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
 
 
 def test_what_a_camera_does_is_believed_and_what_it_does_not_is_held() -> None:
