@@ -222,9 +222,7 @@ class Judge:
         posed, long_side_px = self._posed, self._settings.max_image_px
         assert judged.sampled is not None
 
-        def poll() -> None:
-            if time.monotonic() > deadline:
-                raise OutOfTime
+        poll = _alarm(deadline)
 
         def report(share: float, message: str) -> None:
             poll()
@@ -275,12 +273,7 @@ class Judge:
         """What pictures show, where the given poses have it; None where that breaks off."""
         posed = self._posed
         usual = _LOCATING_S + _LOCATING_PER_IMAGE_S * len(posed.files)
-        deadline = time.monotonic() + min(usual, _MOST_LOCATING_S)
-
-        def poll() -> None:
-            if time.monotonic() > deadline:
-                raise OutOfTime
-
+        poll = _alarm(time.monotonic() + min(usual, _MOST_LOCATING_S))
         try:
             self._match(near_pairs(posed.poses), (0.3, 0.98), "looking for points", poll)
             seen, _ = build_tracks(self._reconstructor.correspondences(), 0.0, self._seed)
@@ -395,6 +388,16 @@ class Judge:
             )
             self._looked |= set(wanted)
         self._reconstructor.match(pairs, watch(middle, end, len(pairs)))
+
+
+def _alarm(deadline: float) -> Callable[[], None]:
+    """What raises OutOfTime from that moment of `time.monotonic` on."""
+
+    def poll() -> None:
+        if time.monotonic() > deadline:
+            raise OutOfTime
+
+    return poll
 
 
 def feature_groups(indices: Sequence[int], lenses: Sequence[Intrinsics]) -> list[CameraGroup]:
