@@ -99,12 +99,14 @@ class FramesOptions(StageOptions):
 class PosesOptions(StageOptions):
     """Structure from motion, and poses that came with the capture."""
 
-    given: Literal["auto", "trust", "refine"] = Field(
+    given: Literal["auto", "trust", "refine", "ignore"] = Field(
         "auto",
         description="Poses that came with the capture are compared with matches of a sample of "
         "pictures. auto refines those that fit less well than exact ones do, and takes the result "
         "where matches that were set aside confirm it; refine tries it in any case and takes what "
-        "is no worse; trust leaves them as they came.",
+        "is no worse; both read poses that most matches contradict by another convention, if they "
+        "fit so, and find others from the pictures for poses that fit in no way; trust leaves them "
+        "as they came; ignore finds poses from the pictures alone.",
     )
     max_image_px: int = Field(
         1600, ge=240, le=8192, description="Features are found at this long side, in pixels."

@@ -20,6 +20,8 @@ REPORT = "report.json"
 """What a stage, or a whole job, says of itself in its own words."""
 CAPTURE_REPORT, CAPTURE_PAGE = "capture-report.json", "capture-report.html"
 """What a job says of how its capture was filmed."""
+POSES_REPLACED = "replaced"
+"""What `poses` says of given poses in whose place others were found from the pictures."""
 
 
 Memory = Literal["full", "small"]

@@ -41,6 +41,7 @@ CAPTURE_FAULTS = frozenset(
 _OF_GIVEN: dict[str, Severity] = {
     "given_poses_contradicted": "severe",
     "given_poses_coarse": "moderate",
+    "given_poses_replaced": "moderate",
 }
 """How grave it is that poses do not fit; that nobody could tell is a note."""
 CAPTURE_STAGES = ("ingest", "frames", "poses")

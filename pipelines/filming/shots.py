@@ -207,11 +207,12 @@ def _with_poses(take: Take, workspace: Workspace) -> Take:
             angle_deg=report.get("median_triangulation_angle_deg"),
             is_metric=report.get("metric"),
         )
+    if report is not None:
+        told = report.get("warnings", [])
+        take = replace(take, doubts=tuple(one for one in told if one["code"] in DOUBTS))
     if report is not None and "given" in report:
-        take = replace(take, given={**report["given"], "warnings": report["warnings"]})
-    elif report is not None:
-        doubts = [one for one in report.get("warnings", []) if one["code"] in DOUBTS]
-        take = replace(take, doubts=tuple(doubts))
+        of_given = [one for one in told if one["code"].startswith("given_")]
+        take = replace(take, given={**report["given"], "warnings": of_given})
     if failed is not None:
         return _partly_placed(take, failed.get("placed"))
     if not workspace.posed_cameras.is_file():

@@ -6,7 +6,8 @@ the features' own errors. Others are refined from matches of all pictures
 (`pipelines.sfm.given_refinement`), and the refined ones are taken where matches that were kept out
 of it say that they are clearly better, and nothing else speaks against them.
 
-Nothing here fails a capture: what goes wrong leaves the given poses, and is told.
+Poses that most matches contradict, and that fit once they are read by another convention, are read
+so. Nothing here fails a capture: what goes wrong leaves the given poses, and is told.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from pipelines.sfm.given_depth import Beside
 from pipelines.sfm.given_fit import Fit, fit_of
 from pipelines.sfm.given_lenses import LensTrial, objection, with_lenses
 from pipelines.sfm.given_pairs import near_pairs, overlapping_pairs, sampled_pairs
-from pipelines.sfm.given_refinement import Refined, located, refine
+from pipelines.sfm.given_refinement import NothingFits, Refined, located, refine
 from pipelines.sfm.given_scale import Scale, scaled, weighed
 from pipelines.sfm.pairs import Pairs
 from pipelines.sfm.tracks import Floats, Observations, build_tracks
@@ -58,6 +59,11 @@ _LOST = 0.5
 """Agreement of an image's own pairs, in that of the median image, below which its pose is
 suspected."""
 _FINE = 0.7
+_DRIFTED, _AHEAD = 0.35, 2.0
+"""Agreement from which poses are read by another convention: `_FINE`; or that of poses that drift,
+if it is so many times that of any other reading."""
+_WRONG = 0.25
+"""Agreement up to which poses have nothing to do with the pictures: drift leaves more."""
 _USUAL = 0.6
 """And that of the median image from which this can be told from drift."""
 _BASE_S, _PER_IMAGE_S = 300.0, 5.0
@@ -65,8 +71,8 @@ _BASE_S, _PER_IMAGE_S = 300.0, 5.0
 _LOCATING_S, _LOCATING_PER_IMAGE_S, _MOST_LOCATING_S = 60.0, 1.0, 1800.0
 """And the search for points under poses that are trusted: depth can do without them."""
 
-_UNREFINED = (PipelineError, ArithmeticError, MemoryError, OSError, RuntimeError, ValueError)
-"""What may go wrong in a refinement without harm to the job: the log has it in full."""
+UNREFINED = (PipelineError, ArithmeticError, MemoryError, OSError, RuntimeError, ValueError)
+"""What may go wrong without harm to the job, which has given poses: the log has it in full."""
 
 
 class OutOfTime(Exception):
@@ -91,14 +97,19 @@ class Judged:
     sampled: the given poses' fit to a sample of pairs, None where too few match. before, after: of
     given and refined poses, by matches that were held out, where refinement got so far. refined:
     its result, whether it was taken or not. lens_trial: whether lenses were adjusted, too. why: in
-    words. located: points where poses that are trusted have them, if they were asked for. seconds:
-    of all.
+    words. reading: in words, how else the file may be read so that its poses fit. written: the fit
+    of the poses as they are written, where they were read so. located: points where poses that are
+    trusted have them, if they were asked for. seconds: of all.
+
+    Of poses that were read otherwise `poses`, `start` and all points are in the world of the file.
     """
 
     mode: Mode
     verdict: Verdict
     why: str
     poses: Floats
+    start: Floats
+    """What was judged, and refined: the given poses as they are read."""
     sampled: Fit | None = None
     before: Fit | None = None
     after: Fit | None = None
@@ -107,6 +118,7 @@ class Judged:
     depths: tuple[Beside, Beside] | None = None
     scale: Scale | None = None
     reading: str | None = None
+    written: Fit | None = None
     located: Refined | None = None
     seconds: float = 0.0
 
@@ -114,6 +126,16 @@ class Judged:
     def depth_by_given_lens(self) -> bool:
         """Whether the sensor's depth is what the lens shows that came along, not the new one."""
         return self.depths is not None and self.depths[1].shown_by == "given"
+
+    @property
+    def is_reread(self) -> bool:
+        """Whether the poses were read by another convention than the file's format has."""
+        return self.written is not None
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether what is handed on has nothing to do with the pictures."""
+        return self.fit is not None and self.fit.agreement < _WRONG
 
     @property
     def fit(self) -> Fit | None:
@@ -158,16 +180,19 @@ class Judge:
         self._locate = locate
         self._looked: set[int] = set()
 
-    def judge(self, mode: Mode, sent: Callable[[Floats], Floats]) -> Judged:
+    def judge(
+        self, mode: Mode, sent: Callable[[Floats], Floats], *, may_reread: bool = True
+    ) -> Judged:
         """The poses to hand on. sent: undoes what ingest did to the world of poses [N, 3, 4],
-        OpenGL axes, to see whether another reading of the file fits.
+        OpenGL axes, to see whether another reading of the file fits. may_reread: whether that
+        reading may be taken.
 
         Raises what `progress` raises.
         """
         began = time.monotonic()
-        judged = Judged(mode, "unverified", "", self._posed.poses)
+        judged = Judged(mode, "unverified", "", self._posed.poses, self._posed.poses)
         try:
-            judged = self._verified(judged, sent)
+            judged = self._verified(judged, sent, may_reread=may_reread and mode != "trust")
             if self._is_to_refine(judged):
                 deadline = began + _BASE_S + _PER_IMAGE_S * len(self._posed.files)
                 judged = self._refined(judged, deadline)
@@ -177,36 +202,51 @@ class Judge:
             raise
         except OutOfTime:
             judged = replace(judged, why="refining them would have taken too long")
-        except _UNREFINED as error:
+        except NothingFits:
+            judged = replace(judged, why=f"{judged.why}, and nothing that is seen fits them")
+        except UNREFINED as error:
             self._logger.warning("Looking at the given poses broke off.", exc_info=True)
             judged = replace(judged, why=f"looking at them broke off: {_words(error)}")
         return replace(judged, seconds=time.monotonic() - began)
 
     def _is_to_refine(self, judged: Judged) -> bool:
-        if judged.mode == "trust" or judged.sampled is None or judged.reading is not None:
+        if judged.mode == "trust" or judged.sampled is None:
+            return False
+        if judged.reading is not None and not judged.is_reread:
             return False
         return judged.mode == "refine" or judged.verdict != "trusted"
 
-    def _verified(self, judged: Judged, sent: Callable[[Floats], Floats]) -> Judged:
-        posed = self._posed
+    def _verified(
+        self, judged: Judged, sent: Callable[[Floats], Floats], *, may_reread: bool
+    ) -> Judged:
+        posed, long_side_px = self._posed, self._settings.max_image_px
         pairs = sampled_pairs(posed.poses)
         self._settle_features()
         self._match(pairs, (0.0, 0.3), "comparing pictures", lambda: None)
         matches = self._reconstructor.verified_of(pairs)
-        fit = fit_of(posed.poses, posed.lenses, matches, self._settings.max_image_px)
+        fit = fit_of(posed.poses, posed.lenses, matches, long_side_px)
         if fit is None:
             return replace(judged, why="too few of the pictures match each other to tell")
-        if fit.error_px <= EXACT_PX and fit.worst_px <= EXACT_WORST_PX and fit.agreement >= _FINE:
-            why = f"matches miss them by {fit.error_px:.2f} px, as those of exact poses do"
-            return replace(judged, verdict="trusted", why=why, sampled=fit)
-        reading = None
-        if fit.agreement < LITTLE:
-            for words, other in other_readings(sent(opengl_from_opencv(posed.poses))):
-                found = fit_of(other, posed.lenses, matches, self._settings.max_image_px)
-                if found is not None and found.agreement >= _FINE:
-                    reading = words
-        why = f"matches miss them by {fit.error_px:.2f} px"
-        return replace(judged, verdict="kept", why=why, sampled=fit, reading=reading)
+        judged = rated(judged, fit)
+        if fit.agreement >= LITTLE:
+            return judged
+        read: list[tuple[Fit, Reading]] = []
+        for reading in other_readings(sent(opengl_from_opencv(posed.poses))):
+            found = fit_of(reading.poses, posed.lenses, matches, long_side_px)
+            if found is not None:
+                read.append((found, reading))
+        read.sort(key=lambda one: one[0].agreement)
+        if not read:
+            return judged
+        (found, best), others = read[-1], [fit, *(each for each, _ in read[:-1])]
+        least = _AHEAD * max(each.agreement for each in others)
+        if found.agreement < min(_FINE, max(least, _DRIFTED)):
+            return judged
+        judged = replace(judged, reading=best.words)
+        if not (may_reread and best.is_whole):
+            return judged
+        self._posed = replace(posed, poses=best.poses)
+        return rated(replace(judged, poses=best.poses, start=best.poses, written=fit), found)
 
     def _settle_features(self) -> None:
         """Double images where a few of them show too little."""
@@ -280,7 +320,7 @@ class Judge:
             return located(posed.poses, posed.lenses, seen, self._settings.max_image_px)
         except Cancelled:
             raise
-        except (OutOfTime, *_UNREFINED):
+        except (OutOfTime, *UNREFINED):
             self._logger.warning("Looking for points broke off: there are none.", exc_info=True)
             return None
 
@@ -305,7 +345,7 @@ class Judge:
             )
         except Cancelled:
             raise
-        except (OutOfTime, *_UNREFINED):
+        except (OutOfTime, *UNREFINED):
             self._logger.warning("Adjusting the given lens broke off: it stays.", exc_info=True)
             return judged
         if found is None:
@@ -458,11 +498,27 @@ def suspects(fit: Fit | None) -> list[int]:
         found.append(worst)
 
 
-def other_readings(poses: Floats) -> list[tuple[str, Floats]]:
-    """What poses would be if they had been written by another convention, and its words.
+def rated(judged: Judged, fit: Fit) -> Judged:
+    """With poses that fit the sample so: trusted, or kept until they are refined."""
+    why = f"matches miss them by {fit.error_px:.2f} px"
+    if fit.error_px <= EXACT_PX and fit.worst_px <= EXACT_WORST_PX and fit.agreement >= _FINE:
+        why = f"{why}, as those of exact poses do"
+        return replace(judged, verdict="trusted", why=why, sampled=fit)
+    return replace(judged, verdict="kept", why=why, sampled=fit)
 
-    poses: [N, 3, 4] as they were sent, OpenGL axes. Returns poses with OpenCV axes.
-    """
+
+@dataclass(frozen=True)
+class Reading:
+    """What poses would be if they had been written by another convention: its words; poses
+    [N, 3, 4], OpenCV axes. is_whole: whether each picture has one so."""
+
+    words: str
+    poses: Floats
+    is_whole: bool = True
+
+
+def other_readings(poses: Floats) -> list[Reading]:
+    """How else poses may be read. poses: [N, 3, 4] as they were sent, OpenGL axes."""
     flip = np.diag([1.0, -1.0, -1.0])
 
     def flipped(all_poses: Floats) -> Floats:
@@ -474,12 +530,13 @@ def other_readings(poses: Floats) -> list[tuple[str, Floats]]:
 
     axes = "their cameras' axes are the others of OpenCV's (Y down, looking along +Z) and OpenGL's"
     inverse = "they lead from the world to the camera, not from the camera to the world"
+    after, before = (flipped(np.roll(poses, shift, axis=0)) for shift in (-1, 1))
     return [
-        (axes, poses),
-        (inverse, flipped(inverted(poses))),
-        (inverse, inverted(flipped(poses))),
-        ("each belongs to the picture after", flipped(np.roll(poses, -1, axis=0))),
-        ("each belongs to the picture before", flipped(np.roll(poses, 1, axis=0))),
+        Reading(axes, poses),
+        Reading(inverse, flipped(inverted(poses))),
+        Reading(inverse, inverted(flipped(poses))),
+        Reading("each belongs to the picture after", after, is_whole=False),
+        Reading("each belongs to the picture before", before, is_whole=False),
     ]
 
 

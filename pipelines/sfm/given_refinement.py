@@ -52,6 +52,10 @@ they show: matches of one pair see only a part of the error."""
 Report = Callable[[float, str], None]
 
 
+class NothingFits(Exception):
+    """No point that pictures show is where the given poses could have seen it."""
+
+
 @dataclass(frozen=True)
 class Refined:
     """poses: [N, 3, 4]. lenses: N, by which they fit. is_seen: [N], whether its own matches say
@@ -84,7 +88,7 @@ def refine(
     """Poses that fit the tracks `seen`.
 
     error_px: by how much matches miss the given poses, of the worse pairs; from there tolerance
-    goes down. long_side_px: at which features were found.
+    goes down. long_side_px: at which features were found. Raises NothingFits.
     """
     num = len(given)
     rays, scales = rays_of(lenses, seen), scales_of(lenses, long_side_px)
@@ -115,6 +119,8 @@ def refine(
                 points, fits = triangulate(seen, rays, poses, limit_px / scales)
             fits = shared(seen, fits & ~(lost & ~anew)[seen.image])
         chosen = thinned(seen, fits, PER_IMAGE)
+        if not chosen.any():
+            raise NothingFits
         if before is None:
             before = as_found(given, lenses, points, fits, seen)
         slack = SLACK * error_px * depth_of(seen, fits, points, poses) / float(np.median(scales))

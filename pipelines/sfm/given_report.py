@@ -28,10 +28,11 @@ def given_report(judged: Judged, posed: Posed, long_side_px: int) -> dict[str, A
         "refinement": None,
         "suspects": [posed.files[index] for index in suspects(fit)],
         "reading": judged.reading,
+        "written": None if judged.written is None else judged.written.as_dict(),
         "seconds": round(judged.seconds, 2),
     }
     if refined is not None and judged.before is not None:
-        turned, moved = movement(posed.poses, refined.poses)
+        turned, moved = movement(judged.start, refined.poses)
         found["refinement"] = {
             "taken": judged.verdict == "refined",
             "before": judged.before.as_dict(),
@@ -41,7 +42,7 @@ def given_report(judged: Judged, posed: Posed, long_side_px: int) -> dict[str, A
             "replaced": [posed.files[index] for index in np.flatnonzero(refined.is_anew).tolist()],
             "moved": {"median": _round(np.median(moved)), "most": _round(moved.max())},
             "turned_deg": {"median": _round(np.median(turned)), "most": _round(turned.max())},
-            "extent": _round(np.linalg.norm(np.ptp(posed.poses[:, :, 3], axis=0))),
+            "extent": _round(np.linalg.norm(np.ptp(judged.start[:, :, 3], axis=0))),
             "sensor_depth": None
             if judged.depths is None
             else {
@@ -74,7 +75,8 @@ def given_warnings(judged: Judged, posed: Posed) -> list[dict[str, Any]]:
     wrong = suspects(fit)
     if fit.agreement < LITTLE or wrong:
         return [_contradicted(judged, fit, [posed.files[index] for index in wrong])]
-    warnings = [] if judged.scale is None else _of_scale(judged.scale)
+    warnings = [] if judged.written is None else [_reread(judged, judged.written)]
+    warnings += [] if judged.scale is None else _of_scale(judged.scale)
     if judged.verdict == "refined" and judged.lens_trial is not None:
         warnings += _of_lens(judged.lens_trial)
     if fit.error_px > DOUBTFUL_PX:
@@ -88,6 +90,35 @@ def given_warnings(judged: Judged, posed: Posed) -> list[dict[str, Any]]:
             }
         )
     return warnings
+
+
+def _reread(judged: Judged, written: Fit) -> dict[str, Any]:
+    return {
+        "code": "given_poses_reread",
+        "message": f"The capture's poses agree with only {written.agreement:.0%} of what its "
+        f"pictures show as they are written. They fit if {judged.reading}, and were read so.",
+        "hint": "Nothing needs to be done. Other programs will read them as they are written; "
+        "poses.given=trust does so here.",
+        "details": {"agreement": round(written.agreement, 4)},
+    }
+
+
+def replaced(found: dict[str, Any], agreement: float) -> dict[str, Any]:
+    """What is to be told of poses that were not used. found: what `given_report` says of them.
+
+    agreement: of the poses that were found from the pictures.
+    """
+    fit = found["sampled"]
+    return {
+        "code": "given_poses_replaced",
+        "message": f"The capture's poses agree with only {fit['agreement']:.0%} of what its "
+        f"pictures show, and were not used. Poses that were found from the pictures agree with "
+        f"{agreement:.0%}.",
+        "hint": "Scale, place and depth of the capture are lost with its poses. Check that no "
+        "picture was added, removed or renamed since they were written; poses.given=trust takes "
+        "them as they are.",
+        "details": {"agreement": fit["agreement"], "found_agreement": round(agreement, 4)},
+    }
 
 
 def _of_scale(scale: Scale) -> list[dict[str, Any]]:

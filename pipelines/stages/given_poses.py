@@ -1,10 +1,11 @@
 """Stage `poses` of a capture that brought its poses: they are verified, and refined where it helps.
 
-Writes cameras.json (the bytes of `ingest`, unless poses were refined), points.ply where there are
-points (those that came along; where poses were refined those that were found with them; where they
-are trusted and came alone those that matches have under them), and report.json (`given`: how well
-the poses fit, and what was done, see `pipelines.sfm.given`). World, scale and order stay those of
-`ingest`.
+Writes cameras.json (the bytes of `ingest`, unless poses were refined or read otherwise), points.ply
+where there are points (those that came along; where poses were refined those that were found with
+them; where they are trusted and came alone those that matches have under them), and report.json
+(`given`: how well the poses fit, and what was done, see `pipelines.sfm.given`). World, scale and
+order stay those of `ingest`; of poses that were read by another convention the world is turned to
+what is up by them.
 """
 
 from __future__ import annotations
@@ -12,24 +13,26 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipelines.captures.world import Move
 from pipelines.exports.formats.ply import write_points
 from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.scene.orientation import opengl_from_opencv
 from pipelines.sfm.attempts import num_processors
-from pipelines.sfm.given import Judge, Judged, Posed
+from pipelines.sfm.given import Judge, Judged, Mode, Posed
 from pipelines.sfm.given_colors import colors_of
 from pipelines.sfm.given_depth import Beside, points_beside
 from pipelines.sfm.given_refinement import Refined
 from pipelines.sfm.given_report import given_report, given_warnings
-from pipelines.sfm.tracks import Floats, apart_deg
+from pipelines.sfm.tracks import apart_deg
 from pipelines.stage import REPORT, StageContext
+from pipelines.stages.given_world import SentWorld
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_settings import FeatureSettings, extraction_threads
 from pipelines.workspace import SPARSE_POINTS
@@ -46,13 +49,36 @@ MOST_FEATURES = 4096
 """Of an image: more say nothing more of its pose, and matching grows with their square."""
 
 
-def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
-    """Verify and perhaps refine the poses of `ingest`. The summary is report.json.
+@dataclass(frozen=True)
+class GivenPoses:
+    """What was found of a capture's poses. report: as report.json has it."""
+
+    judged: Judged
+    posed: Posed
+    cameras: CamerasFile
+    world: SentWorld
+    report: dict[str, Any]
+
+    def write(self, ctx: StageContext) -> dict[str, Any]:
+        """All that the stage writes. The summary is report.json."""
+        ctx.progress(0.99, "writing the poses", 1.0)
+        (ctx.out / SPARSE_POINTS).unlink(missing_ok=True)
+        _write(self, ctx)
+        for warning in self.report["warnings"]:
+            ctx.logger.warning("%s %s", warning["message"], warning["hint"])
+        (ctx.out / REPORT).write_text(json.dumps(self.report, indent=1), "utf-8")
+        ctx.progress(1.0, f"the given poses are {self.judged.verdict}", 0.0)
+        return self.report
+
+
+def judge_given(options: PosesOptions, mode: Mode, ctx: StageContext) -> GivenPoses:
+    """Verify and perhaps refine the poses of `ingest`.
 
     Raises ToolError and CaptureError never: what goes wrong leaves the poses as they came.
     """
     root = ctx.workspace.stage("ingest")
     cameras = CamerasFile.load(root / "cameras.json")
+    world = SentWorld.of(cameras.notes)
     posed = Posed(
         files=tuple(image.file for image in cameras.images),
         lenses=tuple(cameras.cameras[image.camera] for image in cameras.images),
@@ -93,34 +119,17 @@ def run_given(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
             # A sensor knows more of where surfaces are than features do.
             locate=not (root / SPARSE_POINTS).is_file() and not any(depths),
         )
-        judged = judge.judge(options.given, lambda poses: as_sent(poses, cameras.notes))
+        judged = judge.judge(mode, world.sent, may_reread=world.is_rigid)
     ctx.logger.info("The given poses are %s: %s", judged.verdict, judged.why)
-    ctx.progress(0.99, "writing the poses", 1.0)
-    _write(judged, posed, cameras, ctx)
-    warnings = given_warnings(judged, posed)
-    for warning in warnings:
-        ctx.logger.warning("%s %s", warning["message"], warning["hint"])
     report = {
         "num_images": len(posed.files),
         "num_registered": len(posed.files),
         "registered_ratio": 1.0,
         "metric": cameras.metric,
         "given": given_report(judged, posed, options.max_image_px),
-        "warnings": warnings,
+        "warnings": given_warnings(judged, posed),
     }
-    (ctx.out / REPORT).write_text(json.dumps(report, indent=1), "utf-8")
-    ctx.progress(1.0, f"the given poses are {judged.verdict}", 0.0)
-    return report
-
-
-def as_sent(poses: Floats, notes: dict[str, Any]) -> Floats:
-    """Poses [N, 3, 4] in the world that they came in, but for its scale. notes: of cameras.json."""
-    applied = np.array(notes.get("applied_transform", np.eye(3, 4).tolist()), np.float64)
-    scale = float(notes.get("applied_scale", 1.0))
-    sent = applied[:, :3].T @ poses
-    sent[:, :, 3] -= scale * applied[:, :3].T @ applied[:, 3]
-    result: Floats = sent
-    return result
+    return GivenPoses(judged, posed, cameras, world, report)
 
 
 def _settings(options: PosesOptions, ctx: StageContext) -> FeatureSettings:
@@ -136,44 +145,64 @@ def _settings(options: PosesOptions, ctx: StageContext) -> FeatureSettings:
     return replace(wanted, num_threads=threads)
 
 
-def _write(judged: Judged, posed: Posed, cameras: CamerasFile, ctx: StageContext) -> None:
+def _write(found: GivenPoses, ctx: StageContext) -> None:
     """cameras.json and points.ply of the poses to hand on."""
-    root = ctx.workspace.stage("ingest")
-    refined = judged.refined
-    if judged.verdict != "refined" or refined is None:
+    root, judged, posed, cameras = (
+        ctx.workspace.stage("ingest"),
+        found.judged,
+        found.posed,
+        found.cameras,
+    )
+    refined = judged.refined if judged.verdict == "refined" else None
+    move = None
+    if refined is None and not judged.is_reread:
         for name in ("cameras.json", SPARSE_POINTS):
             if (root / name).is_file():
                 shutil.copyfile(root / name, ctx.out / name)
-        if judged.located is not None:
-            try:
-                _write_points(judged.located, root, posed, ctx, least_shown=LEAST_SHOWN)
-            except (MemoryError, OSError):
-                ctx.logger.warning("The points that were found are left out.", exc_info=True)
-                (ctx.out / SPARSE_POINTS).unlink(missing_ok=True)
-        return
-    poses = opengl_from_opencv(judged.poses)
-    lenses = list(cameras.cameras)
-    for image, lens in zip(cameras.images, refined.lenses, strict=True):
-        lenses[image.camera] = lens
-    images = tuple(
-        replace(
-            image,
-            world_from_camera=tuple(tuple(map(float, row)) for row in pose),
-            depth_lens=given if image.depth and judged.depth_by_given_lens else image.depth_lens,
+    else:
+        poses = opengl_from_opencv(judged.poses)
+        notes = {**cameras.notes}
+        if judged.is_reread:
+            move = found.world.settle(poses)
+            poses, notes = move.poses(poses), {**move.notes, "read": judged.reading}
+        lenses = list(cameras.cameras)
+        if refined is not None:
+            notes["poses"] = "refined"
+            for image, lens in zip(cameras.images, refined.lenses, strict=True):
+                lenses[image.camera] = lens
+        images = tuple(
+            replace(
+                image,
+                world_from_camera=tuple(tuple(map(float, row)) for row in pose),
+                depth_lens=given
+                if image.depth and judged.depth_by_given_lens
+                else image.depth_lens,
+            )
+            for image, given, pose in zip(cameras.images, posed.lenses, poses, strict=True)
         )
-        for image, given, pose in zip(cameras.images, posed.lenses, poses, strict=True)
-    )
-    notes = {**cameras.notes, "poses": "refined"}
-    changed = replace(cameras, cameras=tuple(lenses), images=images, notes=notes)
-    changed.save(ctx.out / "cameras.json")
-    _write_points(refined, root, posed, ctx)
+        changed = replace(cameras, cameras=tuple(lenses), images=images, notes=notes)
+        changed.save(ctx.out / "cameras.json")
+    if refined is not None:
+        _write_points(refined, found, move, ctx)
+    elif judged.located is not None:
+        try:
+            _write_points(judged.located, found, move, ctx, least_shown=LEAST_SHOWN)
+        except (MemoryError, OSError):
+            ctx.logger.warning("The points that were found are left out.", exc_info=True)
+            (ctx.out / SPARSE_POINTS).unlink(missing_ok=True)
 
 
 def _write_points(
-    found: Refined, root: Path, posed: Posed, ctx: StageContext, *, least_shown: int = 0
+    found: Refined,
+    of: GivenPoses,
+    move: Move | None,
+    ctx: StageContext,
+    *,
+    least_shown: int = 0,
 ) -> None:
     """points.ply of what is seen by enough images, from far enough apart; of none where the median
-    image shows fewer than `least_shown`."""
+    image shows fewer than `least_shown`. move: of the world that points were found in."""
+    posed, root = of.posed, ctx.workspace.stage("ingest")
     apart = apart_deg(found.seen, found.points, found.poses)
     is_kept = (found.track_lengths >= MIN_TRACK) & (apart >= MIN_APART_DEG)
     shown = np.bincount(found.seen.image[is_kept[found.seen.track]], minlength=len(posed.files))
@@ -181,4 +210,5 @@ def _write_points(
     if len(kept) and np.median(shown) >= least_shown:
         pictures = [root / file for file in posed.files]
         colors = colors_of(found, pictures, kept, ctx.check_cancelled)
-        write_points(ctx.out / SPARSE_POINTS, found.points[kept].astype(np.float32), colors)
+        points = found.points[kept] if move is None else move.points(found.points[kept])
+        write_points(ctx.out / SPARSE_POINTS, points.astype(np.float32), colors)

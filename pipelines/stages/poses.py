@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipelines.errors import PosesError, ToolError
+from pipelines.errors import Cancelled, PosesError, ToolError
 from pipelines.exports.formats.ply import write_points
 from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import CamerasFile, PosedImage
@@ -27,6 +28,8 @@ from pipelines.sfm.attempts import Ladder, num_processors
 from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.clips import clip_warnings, clips_of
 from pipelines.sfm.found_images import FoundImages, found_images
+from pipelines.sfm.given import UNREFINED
+from pipelines.sfm.given_report import replaced
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, unsettled
 from pipelines.sfm.report import (
     build_report,
@@ -38,8 +41,8 @@ from pipelines.sfm.report import (
 from pipelines.sfm.rungs import RUNGS
 from pipelines.sfm.source import Source, prior_focals_px, read_source
 from pipelines.sfm.subpixel import refine_model
-from pipelines.stage import StageContext
-from pipelines.stages.given_poses import run_given
+from pipelines.stage import POSES_REPLACED, REPORT, StageContext
+from pipelines.stages.given_poses import GivenPoses, judge_given
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_adjustment import share_done
 from pipelines.tools.colmap_results import SparseModel
@@ -47,6 +50,9 @@ from pipelines.workspace import SPARSE_POINTS
 
 MIN_TRACK = 3
 """Points seen by fewer images are left out of points.ply: most of them are wrong."""
+
+_LEAST_INSTEAD = 0.7
+"""Of the pictures such poses must have, and matches agree with, to be taken."""
 
 _SUMMARY = (
     "num_images",
@@ -70,12 +76,64 @@ _SUMMARY = (
 def run(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     """Find the poses of a capture's images. The summary is report.json without its lists of images.
 
-    Of a capture that brought its poses see `pipelines.stages.given_poses`.
+    Of a capture that brought its poses see `pipelines.stages.given_poses`; where these
+    have nothing to do with the pictures, they are found from the pictures, and taken if they fit.
     Raises PosesError (no_features, too_few_registered, no_parallax), CaptureError where there are
-    no images, ToolError where COLMAP itself fails.
+    no images, ToolError where COLMAP itself fails; none of them for a capture with poses, unless
+    these are to be ignored.
     """
-    if ctx.workspace.brought_poses:
-        return run_given(options, ctx)
+    mode = options.given
+    if mode == "ignore" or not ctx.workspace.brought_poses:
+        return _found(options, ctx)
+    begun = 0.0
+
+    def watched(fraction: float, message: str, eta_s: float | None) -> None:
+        nonlocal begun
+        begun = max(begun, fraction)
+        ctx.on_progress(fraction, message, eta_s)
+
+    def later(fraction: float, message: str, eta_s: float | None) -> None:
+        ctx.on_progress(begun + (1.0 - begun) * fraction, message, eta_s)
+
+    given = judge_given(options, mode, replace(ctx, on_progress=watched))
+    instead = None
+    if given.judged.is_wrong and mode != "trust":
+        instead = _instead_of(given, options, replace(ctx, on_progress=later))
+    return given.write(ctx) if instead is None else instead
+
+
+def _instead_of(
+    given: GivenPoses, options: PosesOptions, ctx: StageContext
+) -> dict[str, Any] | None:
+    """The summary of poses that were found in place of those given; None where they do not fit.
+
+    Of a thing on a turntable before a still room, say, most matches are of the room.
+    """
+    ctx.logger.info("The given poses have nothing to do with the pictures: looking for others.")
+    try:
+        summary = _found(options, ctx)
+    except Cancelled:
+        raise
+    except UNREFINED as error:
+        ctx.logger.info("There are none: %s", error, exc_info=not isinstance(error, PosesError))
+        return None
+    agreement = summary["agreement"]
+    if summary["registered_ratio"] < _LEAST_INSTEAD or (agreement or 0.0) < _LEAST_INSTEAD:
+        ctx.logger.info("They fit no better.")
+        return None
+    warning = replaced(given.report["given"], agreement)
+    ctx.logger.warning("%s %s", warning["message"], warning["hint"])
+    told = {
+        "given": {**given.report["given"], "verdict": POSES_REPLACED, "refinement": None},
+        "warnings": [warning, *summary["warnings"]],
+    }
+    report = json.loads((ctx.out / REPORT).read_text("utf-8"))
+    _write_report(ctx, {**report, **told})
+    return {**summary, **told}
+
+
+def _found(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
+    """Poses by structure from motion."""
     source = read_source(ctx.workspace)
     checkpoint = Checkpoint(ctx, source, options)
     with tempfile.TemporaryDirectory(prefix="poses-") as scratch:
@@ -192,7 +250,7 @@ def _settle_lenses(
 
 
 def _write_report(ctx: StageContext, report: dict[str, Any]) -> None:
-    (ctx.out / "report.json").write_text(json.dumps(report, indent=1), "utf-8")
+    (ctx.out / REPORT).write_text(json.dumps(report, indent=1), "utf-8")
 
 
 def write_cameras(

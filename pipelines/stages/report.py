@@ -36,7 +36,7 @@ from pipelines.errors import ExportError
 from pipelines.manifest import versions
 from pipelines.options import ReportOptions
 from pipelines.registry import STAGE_NAMES, STAGES
-from pipelines.stage import CAPTURE_PAGE, CAPTURE_REPORT, REPORT, StageContext
+from pipelines.stage import CAPTURE_PAGE, CAPTURE_REPORT, POSES_REPLACED, REPORT, StageContext
 from pipelines.workspace import MANIFEST, Workspace
 
 REPORT_VERSION = 1
@@ -169,13 +169,13 @@ def _quality(manifests: Manifests) -> dict[str, Any]:
 def _poses(manifests: Manifests, capture: CaptureRecord) -> dict[str, Any]:
     """How many images there were and how many have a pose.
 
-    With structure from motion, what it reports. Where the capture brought its poses (`given` tells
-    how well they fit): `num_images`
-    counts the pictures that are in the capture, with a usable pose or not; entries of its listing
-    without a picture are no images and appear in the capture's details and warnings.
+    With structure from motion, what it reports, also where that replaced given poses. Where the
+    capture brought its poses (`given` tells how well they fit): `num_images` counts the pictures
+    that are in the capture, with a usable pose or not; entries of its listing without a picture are
+    no images and appear in the capture's details and warnings.
     """
     judged = manifests.get("poses", {}).get("summary", {})
-    if judged and "given" not in judged:
+    if judged and judged.get("given", {}).get("verdict", POSES_REPLACED) == POSES_REPLACED:
         found = judged
         source = "structure from motion"
         num_images, num_registered = int(found["num_images"]), int(found["num_registered"])
