@@ -12,9 +12,12 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from pipelines.captures.record import CaptureRecord
 from pipelines.errors import Cancelled, PosesError, ToolError
 from pipelines.exports.formats.ply import read_ply, write_points
+from pipelines.manifest import run_stage
 from pipelines.options import PosesOptions
+from pipelines.registry import get_stage
 from pipelines.sample.align import path_extent, similarity
 from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
 from pipelines.scene.sensor_depth import save_sensor_depth
@@ -25,7 +28,7 @@ from pipelines.stages import given_poses
 from pipelines.stages import poses as poses_stage
 from pipelines.stages.poses import run
 from pipelines.tools.colmap import Reconstructor
-from pipelines.workspace import Workspace
+from pipelines.workspace import MANIFEST, Workspace
 from tests.unit.pipelines.sfm.synthetic_room import FOCAL, HEIGHT, WIDTH, arc_poses, render
 
 NUM, FEW = 16, 7
@@ -469,8 +472,9 @@ def test_poses_of_something_else_are_replaced_by_those_that_pictures_have(
     ctx = context(
         tmp_path, scattered(), pictures, on_progress=lambda share, *_: shares.append(share)
     )
-    capture = {"images": [{"file": f"images/{index:05d}.jpg"} for index in range(NUM)]}
-    (ctx.workspace.stage("ingest") / "capture.json").write_text(json.dumps(capture))
+    workspace = ctx.workspace
+    images = [{"file": f"images/{index:05d}.jpg", "name": f"{index}.jpg"} for index in range(NUM)]
+    CaptureRecord("nerfstudio", "a.zip", "00", images=images).save(workspace.stage("ingest"))
     summary = run(OPTIONS.model_copy(update={"given": mode}), ctx)
     assert summary["num_registered"] == NUM
     assert not summary["metric"]
@@ -487,6 +491,13 @@ def test_poses_of_something_else_are_replaced_by_those_that_pictures_have(
         assert summary["given"]["verdict"] == report["given"]["verdict"] == "replaced"
         assert codes(summary) == codes(report) == ["given_poses_replaced"]
         assert summary["given"]["sampled"]["agreement"] < 0.5
+        ctx.out.rename(workspace.stage("poses"))
+        for stage in ("ingest", "poses"):
+            manifest = {"content": stage, "summary": {}, "timings": {}, "options": {}, "files": []}
+            (workspace.stage(stage) / MANIFEST).write_text(json.dumps(manifest))
+        told = run_stage(get_stage("check"), {}, workspace)["summary"]
+        assert "given_poses_replaced" in told["findings"]
+        assert told["verdict"] == "usable"
 
 
 def test_poses_that_none_are_better_than_stay(

@@ -96,6 +96,12 @@ def test_poses_found_by_structure_from_motion_are_passed_on() -> None:
     assert report["poses"]["registered_ratio"] == 0.9
     assert report["poses"]["num_points"] == 5
     assert "frames_s" in report["timings"]
+    given = {"verdict": "replaced", "why": "wrong"}
+    manifests["poses"] = {**manifest, "summary": {**found, "given": given}}
+    report = build_report(manifests, CaptureRecord("nerfstudio", "a.zip", "00"))
+    assert report["poses"]["source"] == "structure from motion"
+    assert report["poses"]["num_registered"] == 63
+    assert report["poses"]["given"] == given
 
 
 def test_structure_from_motion_is_not_metric_and_says_so() -> None:
