@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.nerf.options.stereo import StereoConfig
-from pipelines.nerf.stereo.agreement import AGREE, IN_PICTURE, SEE_THROUGH
+from pipelines.nerf.stereo.agreement import AGREE, SEE_THROUGH
 from pipelines.nerf.stereo.engines import KERNELS, Engine
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf, surface_points, votes_of_others
 from pipelines.nerf.stereo.neighbours import choose_neighbours
@@ -73,7 +73,8 @@ def sensor_maps(
     """The sensor's maps without what other views' sensors contradict; averaged where they agree.
 
     A sensor measures, stereo guesses: a depth that nobody else can speak of is kept, as nearly all
-    are where somebody walks through a corridor. Else more must agree than see through it.
+    are where somebody walks through a corridor. Else more must agree than see through it. Who sees
+    something before it cannot speak of it.
     """
     points = surface_points(views, sensed)
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
@@ -87,7 +88,7 @@ def sensor_maps(
         votes, sums = votes_of_others(z, index, views, maps, neighbours[index], config, engine)
         agreeing = votes[AGREE]
         believed = (z > 0) & (
-            (agreeing > votes[SEE_THROUGH]) | (votes[:IN_PICTURE].sum(axis=0) == 0)
+            (agreeing > votes[SEE_THROUGH]) | (votes[[AGREE, SEE_THROUGH]].sum(axis=0) == 0)
         )
         mean = np.where(believed, (z + sums) / (1.0 + agreeing), 0.0).astype(np.float32)
         kept[index] = DepthMap(mean, np.where(believed, agreeing, 0).astype(np.uint8))

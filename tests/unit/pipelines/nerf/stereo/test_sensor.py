@@ -58,6 +58,15 @@ def test_what_nobody_else_can_speak_of_is_kept() -> None:
     assert (found.votes[HEIGHT // 2 + 2 :] > 0).mean() > 0.9
 
 
+def test_who_sees_something_before_it_cannot_speak_of_it() -> None:
+    """Another room's camera has the wall in its picture, behind its own: neither contradicts."""
+    views, depths = row_of_cameras()
+    nearer = [z if index == 3 else 0.4 * z for index, z in enumerate(depths)]
+    found = sensor_maps(views, sensed(nearer), CONFIG)[3]
+    assert (found.z > 0).mean() > 0.95
+    assert np.abs(found.z / depths[3] - 1.0)[found.z > 0].max() < 0.01
+
+
 def test_an_image_without_depth_has_an_empty_map() -> None:
     views, depths = row_of_cameras()
     some = sensed(depths)
