@@ -96,7 +96,7 @@ def undistorted_picture(
         opened.draft("RGB", size)
         stored = np.asarray(opened.convert("RGB").resize(size, Image.Resampling.BOX))
     picture = levelled(stored, image.light)
-    if not _is_distorted(lens):
+    if _is_as_stored(lens, pinhole):
         return picture
     grid, inside = _warp(lens, pinhole)
     shown: NDArray[np.uint8] = np.rint(at_grid(picture.astype(np.float32), grid)).astype(np.uint8)
@@ -161,7 +161,7 @@ def _undistorted(
     picture: NDArray[np.float32], lens: Intrinsics, pinhole: Pinhole
 ) -> NDArray[np.float32]:
     """The picture [H, W] as the pinhole would show it; negative where it has nothing."""
-    if not _is_distorted(lens):
+    if _is_as_stored(lens, pinhole):
         return picture
     grid, usable = _warp(lens, pinhole)
     there = picture >= 0.0
@@ -185,6 +185,16 @@ def _warp(lens: Intrinsics, pinhole: Pinhole) -> tuple[Tensor, NDArray[np.bool_]
 def _lengths(lens: Pinhole) -> tuple[float, float, float, float]:
     """fl_x, fl_y, cx, cy, px."""
     return lens.fl_x, lens.fl_y, lens.cx, lens.cy
+
+
+def _is_as_stored(lens: Intrinsics, pinhole: Pinhole) -> bool:
+    """Whether the stored picture, reduced, is what the pinhole shows: of a lens without distortion
+    that is wider than pinholes are, it is not."""
+    if _is_distorted(lens):
+        return False
+    x, y = pinhole.width / lens.width, pinhole.height / lens.height
+    stored = (lens.fl_x * x, lens.fl_y * y, lens.cx * x, lens.cy * y)
+    return bool(np.allclose(stored, _lengths(pinhole), rtol=1e-6))
 
 
 def _is_distorted(lens: Intrinsics) -> bool:

@@ -78,3 +78,24 @@ def test_a_reduced_picture_is_seen_through_a_smaller_lens(tmp_path: Path) -> Non
     assert np.abs(half.picture - picture[::2, ::2] - 0.5).max() <= 1.0
     assert np.array_equal(half.usable, np.mgrid[:60, :100][1] < 75)
     assert view.reduced(1) is view
+
+
+@pytest.mark.parametrize("lengths", [(0.29, 0.29), (0.47, 0.31)], ids=["120 degrees", "tall"])
+def test_a_plain_lens_that_is_too_wide_shows_what_it_says(
+    tmp_path: Path, lengths: tuple[float, float]
+) -> None:
+    """Stereo's is zoomed, and so must be the picture: its brightness is the ray's slope."""
+    width, height = 800, 600
+    lens = Intrinsics(width, height, width * lengths[0], width * lengths[1], 400.0, 300.0)
+    slope = (np.arange(width) + 0.5 - lens.cx) / lens.fl_x
+    grey = np.tile(np.rint(128 + 60 * slope).astype(np.uint8), (height, 1))
+    Image.fromarray(grey).convert("RGB").save(tmp_path / "a.png")
+    image = PosedImage("a.png", 0, POSE)
+    view = stereo_view(tmp_path, image, lens, 320)
+    x, _ = view.rays()
+    known = view.picture[120] >= 0
+    shown = (255 * view.picture[120] - 128) / 60
+    assert known.mean() > 0.95
+    assert np.abs(shown - x)[known].max() < 0.03
+    colored = color_view(tmp_path, image, lens, 320)
+    assert np.abs(colored.picture[120, known, 0] / 255.0 - view.picture[120, known]).max() < 0.01
