@@ -9,6 +9,7 @@ does their depth: what they judge must not be made from them.
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections.abc import Callable
@@ -57,7 +58,7 @@ from pipelines.scene.stereo_views import (
 from pipelines.scene.trained_scene import nerf_errors_as, use_all_cores
 from pipelines.stage import StageContext
 from pipelines.stages.depth_checkpoint import DepthCheckpoint, inputs_of
-from pipelines.stages.void_masks import BY_CUTS, known_points, up_and_points
+from pipelines.stages.void_masks import BY_CUTS, known_points, up_and_points, up_of_world
 
 _LOAD_SHARE, _STEREO_SHARE, _VOID_SHARE, _PLANES_SHARE, _WALLS_SHARE = 0.05, 0.7, 0.02, 0.1, 0.1
 _LIGHT_SHARE = 0.03
@@ -156,6 +157,11 @@ class _Search:
     def device(self) -> str:
         """Who computes, as it is told."""
         return _device(self.engine)
+
+    @functools.cached_property
+    def up(self) -> NDArray[np.float64]:
+        """[3], unit."""
+        return up_of_world(self.capture)
 
     def all_passes(self) -> Found:
         """Maps of all images, and what is told of them."""
@@ -311,7 +317,7 @@ class _Search:
         told = {"matched_share": round(_known_share(maps), 4)}
         on_progress = self._progress(_LOAD_SHARE + _STEREO_SHARE + _VOID_SHARE, _PLANES_SHARE)
         given = self.views, maps, self.config, on_progress, self.engine
-        return completed(*given, self.checkpoint.shelves, self.patches), told
+        return completed(*given, self.checkpoint.shelves, self.patches, up=self.up), told
 
     def _stood_up(self) -> Found:
         maps = self.checkpoint.maps()
@@ -319,7 +325,7 @@ class _Search:
         begun = _LOAD_SHARE + _STEREO_SHARE + _VOID_SHARE + _PLANES_SHARE
         on_progress = self._progress(begun, _WALLS_SHARE)
         given = self.views, maps, self.config, on_progress, self.engine
-        return stood_up(*given, self.checkpoint.shelves, self.patches), told
+        return stood_up(*given, self.checkpoint.shelves, self.patches, up=self.up), told
 
 
 def _rounded(share: float, num_views: int) -> dict[str, Any]:

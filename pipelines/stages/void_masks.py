@@ -39,12 +39,19 @@ def known_points(workspace: Workspace) -> Floats | None:
 
 
 def up_and_points(workspace: Workspace, capture: CamerasFile) -> tuple[Floats, Floats]:
-    """What tells sky from other things: up [3], unit, and `known_points`, none without any."""
-    up = np.array([0.0, 0.0, 1.0])
-    if capture.notes.get("up_from") != "measured":
-        up, _ = find_up(np.array([image.world_from_camera for image in capture.images], np.float64))
+    """What tells sky from other things: `up_of_world`, and `known_points`, none without any."""
     points = known_points(workspace)
-    return up, np.zeros((0, 3)) if points is None else points
+    return up_of_world(capture), np.zeros((0, 3)) if points is None else points
+
+
+def up_of_world(capture: CamerasFile) -> Floats:
+    """Up, [3], unit: +Z, as `ingest` or `poses` have turned the world; as its pictures have it
+    where nobody did. Pictures that are stored on their side would tell less of it.
+    """
+    if capture.notes.get("up_from") != "none":
+        return np.array([0.0, 0.0, 1.0])
+    up, _ = find_up(np.array([image.world_from_camera for image in capture.images], np.float64))
+    return up
 
 
 def void_masks(

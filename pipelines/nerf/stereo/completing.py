@@ -33,6 +33,7 @@ from pipelines.nerf.stereo.planes import (
     floors_of,
     laid_on_planes,
     planes_and_samples,
+    up_of,
 )
 from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
 from pipelines.nerf.stereo.tops import Rims, laid_on_tops, upwards
@@ -51,13 +52,15 @@ def completed(
     engine: Engine = KERNELS,
     shelves: Shelves = MEMORY,
     patches: Shelf | None = None,
+    *,
+    up: Floats | None = None,
 ) -> MapShelf:
     """The maps with their plain patches on the planes and table tops of the scene.
 
     Depths within 1 % of their patch's plane move onto it; unknown pixels of the patch get its depth
     unless more neighbours see through it than agree. All others stay as they are, but for those on
     table tops that are their surroundings' (`laid_on_tops`). patches: a shelf for the pictures'
-    `patches_of`, or with them.
+    `patches_of`, or with them. up: [3], unit, where it is known better than pictures tell.
     """
     planes, points, depths = planes_and_samples(
         views, maps, lambda f: on_progress(_SAMPLES_SHARE * f, _MESSAGE)
@@ -76,10 +79,11 @@ def completed(
 
     for index, _ in enumerate(each_ahead(lay, range(len(views)))):
         share_done(_SAMPLES_SHARE, _LAID_SHARE, (index + 1) / len(views))
-    normal = upwards(views, planes) if config.level_tops else None
+    up = up_of(views) if up is None else up
+    normal = upwards(up, planes) if config.level_tops else None
     if normal is not None:
         on_share = partial(share_done, _LAID_SHARE, _TOPS_SHARE)
-        floors = planes[floors_of(views, planes, points, depths)]
+        floors = planes[floors_of(up, planes, points, depths)]
         _lay_on_tops(views, depths_of(maps), (normal, floors), filled, patches, on_share)
     seen = surface_points(views, depths_of(maps))
     neighbours = choose_neighbours(views, seen, config.num_neighbours, config.best_angle_deg)

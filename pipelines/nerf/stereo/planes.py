@@ -77,26 +77,28 @@ def planes_and_samples(
     return np.array(planes).reshape(-1, 4), every[0], every[2]
 
 
-def levels_of(views: Sequence[StereoView], planes: Floats) -> Floats:
-    """[P], the cosine between each plane's n and up: 1 or -1 of a level one.
+def up_of(views: Sequence[StereoView]) -> Floats:
+    """Which way is up, [3], unit, where nothing else says so: as the pictures have it in the mean.
 
-    Which way is up: as the pictures have it in the mean.
+    Of pictures that are stored on their side, or look straight down, that is wrong.
     """
-    up = np.mean([-view.world_from_camera[:, 1] for view in views], axis=0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
+    up: Floats = np.mean([-view.world_from_camera[:, 1] for view in views], axis=0)
+    return up / max(float(np.linalg.norm(up)), 1e-12)
+
+
+def levels_of(up: Floats, planes: Floats) -> Floats:
+    """[P], the cosine between each plane's n and up [3]: 1 or -1 of a level one."""
     cosines: Floats = planes[:, :3] @ up
     return cosines
 
 
-def floors_of(
-    views: Sequence[StereoView], planes: Floats, points: Floats, depths: Floats
-) -> list[int]:
+def floors_of(up: Floats, planes: Floats, points: Floats, depths: Floats) -> list[int]:
     """Numbers of the planes that are about level, and below which nothing is known.
 
-    points: [K, 3], with their depths [K].
+    up: [3]. points: [K, 3], with their depths [K].
     """
     found = []
-    for number, (plane, level) in enumerate(zip(planes, levels_of(views, planes), strict=True)):
+    for number, (plane, level) in enumerate(zip(planes, levels_of(up, planes), strict=True)):
         height = (points @ plane[:3] - plane[3]) * np.sign(level)
         if abs(level) >= LEVEL and (height < -_BELOW * depths).mean() <= _MOST_BELOW:
             found.append(number)

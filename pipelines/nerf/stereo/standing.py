@@ -39,6 +39,7 @@ from pipelines.nerf.stereo.planes import (
     levels_of,
     planes_and_samples,
     ray_grid,
+    up_of,
 )
 from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
 from pipelines.nerf.stereo.spreading import (
@@ -114,18 +115,22 @@ def stood_up(
     engine: Engine = KERNELS,
     shelves: Shelves = MEMORY,
     patches: Shelf | None = None,
+    *,
+    up: Floats | None = None,
 ) -> MapShelf:
     """The maps with plain patches on the walls that their borders with the floor tell of.
 
     Pixels of plain patches change that are unknown, or seem to be nearer than the wall: they get
     its depth where a neighbour agrees and none sees through it, or twice as many agree. patches: a
-    shelf for the pictures' `patches_of`, or with them.
+    shelf for the pictures' `patches_of`, or with them. up: [3], unit, where it is known better than
+    pictures tell.
     """
     planes, points, depths = planes_and_samples(
         views, maps, lambda done: on_progress(_PLANES_SHARE * done, _MESSAGE)
     )
-    planes = planes[_is_level_or_upright(levels_of(views, planes))]
-    floors = floors_of(views, planes, points, depths)
+    up = up_of(views) if up is None else up
+    planes = planes[_is_level_or_upright(levels_of(up, planes))]
+    floors = floors_of(up, planes, points, depths)
     if not floors:
         return maps
 

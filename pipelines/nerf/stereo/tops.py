@@ -146,9 +146,10 @@ def _middle_of_longest_run(numbers: NDArray[np.int64]) -> float:
     return float(longest[len(longest) // 2])
 
 
-def upwards(views: Sequence[StereoView], planes: Floats) -> Floats | None:
-    """The normal [3], upwards, of the first of the planes [P, 4] that is about level, if any."""
-    levels = levels_of(views, planes)
+def upwards(up: Floats, planes: Floats) -> Floats | None:
+    """The normal [3], as up [3] as can be, of the first of the planes [P, 4] that is about level,
+    if any."""
+    levels = levels_of(up, planes)
     flat = np.flatnonzero(np.abs(levels) >= LEVEL)
     if not len(flat):
         return None

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
+from pipelines.nerf.stereo.planes import up_of
 from pipelines.nerf.stereo.standing import _is_level_or_upright, stood_up
 from tests.unit.pipelines.nerf.stereo.blank_room import WALL, Seen, look, walk
 
@@ -164,3 +166,35 @@ def test_nothing_is_laid_aslant_by_its_border_alone() -> None:
     """Planes of small surfaces, 8 degrees off upright, are touched by some border, too."""
     assert _is_level_or_upright(np.array([1.0, -0.99, 0.85, 0.0, -0.08])).all()
     assert not _is_level_or_upright(np.array([0.139, -0.5, 0.7])).any()
+
+
+def on_its_side(one: Seen) -> Seen:
+    """The same rays of the same place, stored a quarter turned."""
+    view, height_px = one.view, one.view.picture.shape[1]
+    fx, fy, cx, cy = view.lens
+    x, y, z, center = view.world_from_camera.T
+    return dataclasses.replace(
+        one,
+        view=dataclasses.replace(
+            view,
+            picture=np.ascontiguousarray(np.rot90(view.picture)),
+            lens=(fy, fx, cy, height_px - cx),
+            world_from_camera=np.column_stack([y, -x, z, center]),
+        ),
+        depth=np.ascontiguousarray(np.rot90(one.depth)),
+        on_floor=np.ascontiguousarray(np.rot90(one.on_floor)),
+    )
+
+
+@pytest.mark.parametrize("every", [1, 2], ids=["all", "every second"])
+def test_pictures_that_are_stored_on_their_side_show_the_same_wall(every: int) -> None:
+    seen = [look(place) for place in walk()]
+    up = up_of([one.view for one in seen])
+    seen = [on_its_side(one) if i % every == 0 else one for i, one in enumerate(seen)]
+    before = MapShelf.of([one.known() for one in seen])
+    found = stood_up([one.view for one in seen], before, CONFIG, up=up)
+    for one, after in zip(seen, found, strict=True):
+        wall = ~one.on_floor
+        assert (after.z[wall] > 0).mean() > 0.8
+        there = wall & (after.z > 0)
+        assert np.abs(after.z[there] / one.depth[there] - 1.0).max() < 0.02

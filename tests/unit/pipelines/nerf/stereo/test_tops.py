@@ -10,7 +10,7 @@ from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
 from pipelines.nerf.stereo.patches import even_patches
-from pipelines.nerf.stereo.planes import floors_of, planes_and_samples
+from pipelines.nerf.stereo.planes import floors_of, planes_and_samples, up_of
 from pipelines.nerf.stereo.tops import Rims, laid_on_tops, upwards
 from tests.unit.pipelines.nerf.stereo.white_table import (
     FLOOR,
@@ -68,9 +68,9 @@ def test_the_height_is_found_from_the_rim() -> None:
     views, maps = [one.view for one in seen], [one.known() for one in seen]
     planes, points, depths = planes_and_samples(views, maps)
     assert np.abs(np.abs(planes @ [0.0, 1.0, 0.0, 0.0]) * np.abs(planes[:, 3]) - TOP).min() > 0.1
-    (floor,) = floors_of(views, planes, points, depths)
+    (floor,) = floors_of(up_of(views), planes, points, depths)
     assert np.abs(np.abs(planes[floor]) - FLOOR_PLANE).max() < 0.01
-    normal = upwards(views, planes)
+    normal = upwards(up_of(views), planes)
     assert normal is not None
     assert normal @ UP > 0.999
     (top,) = rims_of(seen).tops(normal, FLOOR_PLANE)
@@ -115,8 +115,8 @@ def test_two_views_are_not_enough() -> None:
 def test_without_a_level_plane_there_are_no_tops() -> None:
     seen = walk_round()
     views = [one.view for one in seen]
-    assert upwards(views, np.array([[0.0, 0.0, 1.0, 3.0], [0.6, 0.5, 0.62, 1.0]])) is None
-    assert upwards(views, np.zeros((0, 4))) is None
+    assert upwards(up_of(views), np.array([[0.0, 0.0, 1.0, 3.0], [0.6, 0.5, 0.62, 1.0]])) is None
+    assert upwards(up_of(views), np.zeros((0, 4))) is None
 
 
 def test_the_wall_behind_a_chest_does_not_begin_at_its_height() -> None:
