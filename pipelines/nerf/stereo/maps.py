@@ -23,7 +23,7 @@ from pipelines.nerf.stereo.views import StereoView, camera_extent
 Floats = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
-_MAX_POINTS = 4000
+_MAX_POINTS, _PER_VIEW = 4000, 25
 _PROBE_VIEWS, _PROBE_LONG_SIDE, _PROBE_NEIGHBOURS, _PROBE_PLANES = 32, 160, 6, 160
 _PROBE_NEAREST = 0.1
 """The nearest surface tried where nothing is known, in units of the cameras' extent."""
@@ -125,7 +125,7 @@ def find_depth_maps(
                 views, config, lambda f, text: on_progress(_PROBE_SHARE * f, text), engine
             )
         points, begun = probed[0], _PROBE_SHARE
-    points = thinned(points)
+    points = thinned(points, _most_points(len(views)))
     neighbours = choose_neighbours(views, points, config.num_neighbours, config.best_angle_deg)
     ranges = [depth_range(view, points) for view in views]
     known = [item for item in ranges if item is not None]
@@ -213,14 +213,20 @@ def surface_points(
         for view, z in zip(views, depths, strict=True)
         if z is not None
     ]
-    return thinned(np.concatenate(found)) if found else np.zeros((0, 3))
+    most = _most_points(len(views))
+    return thinned(np.concatenate(found), most) if found else np.zeros((0, 3))
 
 
-def thinned(points: Floats) -> Floats:
-    """At most 4,000 of the points [P, 3], evenly picked."""
-    if len(points) <= _MAX_POINTS:
+def _most_points(num_views: int) -> int:
+    """Of the scene that are looked at: many views may have been taken in many rooms."""
+    return max(_MAX_POINTS, _PER_VIEW * num_views)
+
+
+def thinned(points: Floats, most: int = _MAX_POINTS) -> Floats:
+    """At most so many of the points [P, 3], evenly picked."""
+    if len(points) <= most:
         return points
-    thinned: Floats = points[np.linspace(0, len(points) - 1, _MAX_POINTS).astype(int)]
+    thinned: Floats = points[np.linspace(0, len(points) - 1, most).astype(int)]
     return thinned
 
 

@@ -23,6 +23,9 @@ _LEAST_SCORE = 0.02
 _MIN_POINTS = 20
 _NEAREST, _FARTHEST = 0.6, 3.0
 """Beyond the points' own range: surfaces without texture have no points."""
+_PARTS, _BEHIND = (6, 8), 1.5
+"""Rows and columns of a picture's parts, and how many times as far a point may be as the nearest
+in its part to be seen with it."""
 _NEAR_PERCENTILE, _FAR_PERCENTILE = 1.0, 99.0
 
 
@@ -34,10 +37,11 @@ def choose_neighbours(
     points: [P, 3]. The score of a pair is the share of the view's points that the other sees too,
     each weighted by exp(-(angle - best)^2 / (2 s^2)) of the angle at the point between both, with s
     2 degrees below the best angle and 10 above. Source: MVSNet, arXiv:1804.02505, section 4.1.
+    What a view sees is `seen_before_others`.
     """
     centers = np.array([view.center for view in views])
     axes = np.array([view.axis for view in views])
-    shown = np.array([view.seen(points)[1] for view in views])
+    shown = np.array([seen_before_others(view, points)[1] for view in views])
     toward = points[None] - centers[:, None]
     toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-12)
     facing = axes @ axes.T > np.cos(np.radians(_MAX_AXIS_DEG))
@@ -87,9 +91,28 @@ def _nearest(centers: Floats, facing: NDArray[np.bool_], index: int, count: int)
     return [int(other) for other in order if np.isfinite(distance[other])]
 
 
+def seen_before_others(view: StereoView, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Depths [P] of world points [P, 3], and which of them the picture shows, but for those that
+    are clearly behind another one in their part of it.
+
+    A wall hides the next room, whose cameras have all of this one's points in their pictures.
+    """
+    depths, u, v, shown = view.projected(points)
+    rows, columns = _PARTS
+    height, width = view.picture.shape
+    there = np.flatnonzero(shown)
+    part = (v[there] * rows / height).astype(np.int64) * columns
+    part += (u[there] * columns / width).astype(np.int64)
+    nearest = np.full(rows * columns, np.inf)
+    np.minimum.at(nearest, part, depths[there])
+    seen = shown.copy()
+    seen[there] = depths[there] <= _BEHIND * nearest[part]
+    return depths, seen
+
+
 def depth_range(view: StereoView, points: Floats) -> tuple[float, float] | None:
     """(nearest, farthest) depth worth trying, world units; None where too few points tell."""
-    depths, shown = view.seen(points)
+    depths, shown = seen_before_others(view, points)
     if shown.sum() < _MIN_POINTS:
         return None
     near, far = np.percentile(depths[shown], (_NEAR_PERCENTILE, _FAR_PERCENTILE))

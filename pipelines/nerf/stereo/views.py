@@ -58,22 +58,22 @@ class StereoView:
 
     def seen(self, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Depths [P] of world points [P, 3], and which of them the picture shows."""
-        z, _, _, shown = self._projected(points)
+        z, _, _, shown = self.projected(points)
         return z, shown
 
     def seen_at(self, points: Floats) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
         """Depths, rows and columns, [S] each, of the world points [P, 3] that the picture shows."""
-        z, u, v, shown = self._projected(points)
+        z, u, v, shown = self.projected(points)
         return z[shown], v[shown].astype(np.int64), u[shown].astype(np.int64)
 
     def shown_at(
         self, points: Floats
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Which of the world points [P, 3] the picture shows, [S], and their rows and columns."""
-        _, u, v, shown = self._projected(points)
+        _, u, v, shown = self.projected(points)
         return np.flatnonzero(shown), v[shown].astype(np.int64), u[shown].astype(np.int64)
 
-    def _projected(self, points: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    def projected(self, points: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
         """z, u and v [P] of world points [P, 3], and which of them the picture shows."""
         local = (points - self.center) @ self.world_from_camera[:, :3]
         z = local[:, 2]

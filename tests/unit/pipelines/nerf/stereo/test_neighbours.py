@@ -1,0 +1,72 @@
+"""Which views see the same, in a flat of closed rooms filmed from within each."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.nerf.stereo.neighbours import choose_neighbours, depth_range, seen_before_others
+from pipelines.nerf.stereo.views import StereoView
+
+Floats = NDArray[np.float64]
+SIDE, PER_ROOM, ROOMS = 4.0, 12, 9
+LENS = (74.0, 74.0, 48.0, 36.0)
+
+
+def room(number: int) -> Floats:
+    return np.array([number % 3 * SIDE, number // 3 * SIDE, 0.0])
+
+
+def on_walls(number: int, num: int = 800) -> Floats:
+    """Points [P, 3] on the walls of a room."""
+    random = np.random.default_rng(number)
+    points = random.uniform(-0.5, 0.5, (num, 3)) * [SIDE, SIDE, 2.0]
+    wall = random.integers(0, 4, num)
+    points[np.arange(num), wall % 2] = np.where(wall < 2, -0.49, 0.49) * SIDE
+    return points + room(number)
+
+
+def inside(number: int) -> list[StereoView]:
+    """Cameras near the middle of a room, all round, that look outwards."""
+    found = []
+    for angle in np.linspace(0.0, 2.0 * np.pi, PER_ROOM, endpoint=False):
+        axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+        right = np.array([np.sin(angle), -np.cos(angle), 0.0])
+        center = room(number) - 0.3 * axis
+        pose = np.column_stack([right, [0.0, 0.0, -1.0], axis, center])
+        found.append(StereoView(np.zeros((72, 96), np.float32), LENS, pose))
+    return found
+
+
+VIEWS = [view for number in range(ROOMS) for view in inside(number)]
+POINTS = np.concatenate([on_walls(number) for number in range(ROOMS)])
+
+
+def test_a_view_sees_the_walls_of_its_room_and_little_behind_them() -> None:
+    shares = []
+    for index, view in enumerate(VIEWS):
+        _, seen = seen_before_others(view, POINTS)
+        own = np.abs(POINTS - room(index // PER_ROOM))[:, :2].max(axis=1) < 0.5 * SIDE
+        _, shown = view.seen(POINTS)
+        assert (seen & own).sum() > 0.95 * (shown & own).sum()
+        shares.append((own[seen].mean(), own[shown].mean()))
+    seen_share, shown_share = np.mean(shares, axis=0)
+    assert seen_share > 0.5 > 0.4 > shown_share
+
+
+def test_views_are_compared_with_those_of_their_own_room() -> None:
+    neighbours = choose_neighbours(VIEWS, POINTS, 4, 6.0)
+    own = [
+        [other // PER_ROOM == index // PER_ROOM for other in found]
+        for index, found in enumerate(neighbours)
+    ]
+    assert all(own)
+    assert np.mean(np.concatenate(own)) > 0.9
+
+
+def test_depth_is_sought_within_the_room() -> None:
+    for view in VIEWS:
+        limits = depth_range(view, POINTS)
+        assert limits is not None
+        assert limits[0] < 0.45 * SIDE
+        assert limits[1] < 6.0 * SIDE
