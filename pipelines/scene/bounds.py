@@ -11,6 +11,8 @@ Captures come in three shapes, told apart by the poses alone:
   are nearly parallel or meet behind the cameras. Then the surface that the trained scene shows in
   the middle of its views decides: the focus is its median, the distance the larger of the cameras'
   mean distance to it and the median depth.
+
+Cameras that are far away from all others hardly count (`usual_distance`).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.scene.depth_views import DepthView
-from pipelines.scene.focus import find_focus
+from pipelines.scene.focus import find_focus, usual_distance
 
 Floats = NDArray[np.float64]
 
@@ -107,11 +109,10 @@ def scene_bounds(
         return None
     focus = find_focus(poses)
     if focus is not None:
-        distance = float(np.linalg.norm(poses[:, :, 3] - focus, axis=1).mean())
+        distance = usual_distance(poses, focus)
     else:
         focus = np.median(central, axis=0)
-        from_cameras = float(np.linalg.norm(poses[:, :, 3] - focus, axis=1).mean())
-        distance = max(from_cameras, float(np.median(depths)))
+        distance = max(usual_distance(poses, focus), float(np.median(depths)))
     radius = max_distance * distance
     near = surface[np.linalg.norm(surface - focus, axis=1) <= radius]
     if len(near) == 0:

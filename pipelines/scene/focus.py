@@ -23,6 +23,8 @@ _MAX_ASIDE_COS = np.cos(np.radians(30.0))
 """A camera looks at the point when it is within 30 degrees of its axis: within most pictures."""
 _MIN_SHARE = 0.6
 _MAX_ROUNDS = 20
+_MOST = 3.0
+"""How many times as far as the median camera one counts at most."""
 
 
 def find_focus(world_from_camera: Floats) -> Floats | None:
@@ -52,3 +54,10 @@ def find_focus(world_from_camera: Floats) -> Floats | None:
             break
         looking = now_looking
     return focus
+
+
+def usual_distance(poses: Floats, focus: Floats) -> float:
+    """The mean distance of cameras [N, 3, 4] from a point [3]; one picture of the whole from afar,
+    or a pose that is wrong, hardly changes it."""
+    far = np.linalg.norm(poses[:, :, 3] - focus, axis=1)
+    return float(np.minimum(far, _MOST * np.median(far)).mean())

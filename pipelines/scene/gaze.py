@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.depth_views import Pinhole
-from pipelines.scene.focus import find_focus
+from pipelines.scene.focus import find_focus, usual_distance
 
 Floats = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def told_by_cameras(gaze: Gaze) -> Told:
     cosine = -(gaze.poses[:, :, 2] * toward).sum(axis=1)
     looking = float((cosine > np.cos(np.radians(30.0))).mean())
     arc = float(np.degrees(np.arccos(np.clip((toward @ toward.T).min(), -1.0, 1.0))))
-    where = focus, float(far.mean())
+    where = focus, usual_distance(gaze.poses, focus)
     measures = {
         "looking": round(looking, 3),
         "arc_deg": round(arc, 1),

@@ -82,7 +82,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
 
 EXPORT = Export(
     kind="meshvideo",
-    version=2,
+    version=3,
     reads=("mesh",),
     run=run,
     options=MeshVideoOptions,

@@ -258,7 +258,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=12,
+    version=13,
     reads=("ingest", "depth", "mesh"),
     run=run,
     options=PointcloudOptions,

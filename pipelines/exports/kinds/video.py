@@ -141,7 +141,7 @@ _PLAYER = "any browser or player"
 
 EXPORT = Export(
     kind="video",
-    version=6,
+    version=7,
     reads=("mesh",),
     run=run,
     options=VideoOptions,

@@ -56,25 +56,33 @@ def make_path(options: PathOptions, images: Sequence[PosedImage], num_frames: in
 def held_upright(
     images: Sequence[PosedImage], lens: Intrinsics
 ) -> tuple[Sequence[PosedImage], Intrinsics]:
-    """The cameras and their typical lens, turned by a quarter where photos lie on their side: as
-    apps store them of a phone that is held upright, and as they lie once EXIF is lost.
+    """The cameras and their typical lens, those turned whose photos lie on their side, or stand on
+    their head: as apps store them of a phone that is held so, and as they lie once EXIF is lost.
 
-    lens: without tangential distortion, as `typical_lens` gives it.
+    Each has its own quarter; the lens, and cameras that look straight down, that of most. lens:
+    without tangential distortion, as `typical_lens` gives it.
     """
-    poses = np.asarray([image.world_from_camera for image in images], np.float64)
-    right = float(np.median(poses[:, 2, 0])) if len(poses) else 0.0
-    top = float(np.median(poses[:, 2, 1])) if len(poses) else 0.0
-    if abs(right) < max(_ON_THEIR_SIDE, _CLEARLY * abs(top)):
+    if not images:
         return images, lens
-    # The new X and Y axes in the old ones: what was at the right, or at the left, is above now.
-    turn = (
-        np.array([[0.0, 1.0], [-1.0, 0.0]]) if right > 0.0 else np.array([[0.0, -1.0], [1.0, 0.0]])
-    )
-    poses[:, :, :2] = poses[:, :, :2] @ turn
+    poses = np.asarray([image.world_from_camera for image in images], np.float64)
+    right, top = poses[:, 2, 0], poses[:, 2, 1]
+    lies = np.abs(right) >= np.maximum(_ON_THEIR_SIDE, _CLEARLY * np.abs(top))
+    stands = np.abs(top) >= np.maximum(_ON_THEIR_SIDE, _CLEARLY * np.abs(right))
+    # Quarters: what was at the right, below or at the left is above then.
+    own = np.where(lies, np.where(right > 0.0, 1, 3), np.where(top > 0.0, 0, 2))
+    usual = int(np.bincount(own[lies | stands], minlength=4).argmax())
+    quarters = np.where(lies | stands, own, usual)
+    if not quarters.any():
+        return images, lens
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    turns = np.array([np.linalg.matrix_power(turn, quarter) for quarter in range(4)])
+    poses[:, :, :2] = poses[:, :, :2] @ turns[quarters]
     turned = [
         replace(image, world_from_camera=tuple(tuple(row) for row in pose.tolist()))
         for image, pose in zip(images, poses, strict=True)
     ]
+    if usual % 2 == 0:
+        return turned, lens
     return turned, replace(
         lens,
         width=lens.height,

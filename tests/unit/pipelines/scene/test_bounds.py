@@ -24,6 +24,19 @@ def test_background_beyond_max_distance_is_cut_off() -> None:
     assert not bounds.contains(background).any()
 
 
+@pytest.mark.parametrize("away", [10.0, 60.0])
+def test_one_picture_from_afar_leaves_the_scene_as_it_is(away: float) -> None:
+    thing = np.random.default_rng(0).uniform(-0.5, 0.5, (2000, 3))
+    poses = ring(20, np.zeros(3))
+    usual = scene_bounds(poses, thing, thing, np.full(2000, 3.0), 2.0)
+    poses[7, :, 3] *= away
+    bounds = scene_bounds(poses, thing, thing, np.full(2000, 3.0), 2.0)
+    assert usual is not None
+    assert bounds is not None
+    assert bounds.distance < 1.15 * usual.distance
+    assert np.linalg.norm(bounds.focus - usual.focus) < 1e-6
+
+
 def test_a_forward_facing_capture_is_bounded_by_the_depth_it_shows() -> None:
     rng = np.random.default_rng(1)
     poses = np.stack(

@@ -80,6 +80,23 @@ def test_pictures_on_their_side_are_shown_upright(quarter: int) -> None:
     np.testing.assert_allclose(np.rot90(before, quarter), after, atol=1e-12)
 
 
+@pytest.mark.parametrize("quarters", [(0, 1), (1, 0), (0, 2), (1, 3), (0, 1, 2, 3)])
+def test_each_picture_is_turned_by_its_own_quarter(quarters: tuple[int, ...]) -> None:
+    """A phone that is turned on the way: the film stays level."""
+    upright = np.array(ring(12, np.zeros(3)))
+    stored = upright.copy()
+    for index, pose in enumerate(stored):
+        quarter = quarters[index * len(quarters) // 12]
+        turn = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarter)
+        pose[:, :2] = pose[:, :2] @ turn
+    images = [
+        PosedImage(f"{index}.jpg", 0, tuple(tuple(map(float, row)) for row in pose))
+        for index, pose in enumerate(stored)
+    ]
+    shown, _ = held_upright(images, Intrinsics(40, 30, 33.0, 33.0, 20.0, 15.0))
+    np.testing.assert_allclose([image.world_from_camera for image in shown], upright, atol=1e-12)
+
+
 def test_pictures_on_their_side_from_steeply_above_are_shown_upright_too() -> None:
     place = np.array([0.0, -1.0, 1.8])  # 61 degrees down
     pose = look_at(place, np.zeros(3))
