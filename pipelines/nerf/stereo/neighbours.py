@@ -111,11 +111,17 @@ def seen_before_others(view: StereoView, points: Floats) -> tuple[Floats, NDArra
 
 
 def depth_range(view: StereoView, points: Floats) -> tuple[float, float] | None:
-    """(nearest, farthest) depth worth trying, world units; None where too few points tell."""
-    depths, shown = seen_before_others(view, points)
-    if shown.sum() < _MIN_POINTS:
+    """(nearest, farthest) depth worth trying, world units; None where too few points tell.
+
+    The nearest by what is `seen_before_others`. The farthest by all points, as through a fence
+    something is seen, too; planes even in inverse depth are few out there.
+    """
+    depths, seen = seen_before_others(view, points)
+    _, shown = view.seen(points)
+    if seen.sum() < _MIN_POINTS:
         return None
-    near, far = np.percentile(depths[shown], (_NEAR_PERCENTILE, _FAR_PERCENTILE))
+    near = np.percentile(depths[seen], _NEAR_PERCENTILE)
+    far = np.percentile(depths[shown], _FAR_PERCENTILE)
     return _NEAREST * float(near), _FARTHEST * float(far)
 
 

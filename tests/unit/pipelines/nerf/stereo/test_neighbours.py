@@ -64,9 +64,25 @@ def test_views_are_compared_with_those_of_their_own_room() -> None:
     assert np.mean(np.concatenate(own)) > 0.9
 
 
-def test_depth_is_sought_within_the_room() -> None:
+def test_depth_is_sought_from_the_walls_of_the_room_on() -> None:
     for view in VIEWS:
         limits = depth_range(view, POINTS)
         assert limits is not None
         assert limits[0] < 0.45 * SIDE
-        assert limits[1] < 6.0 * SIDE
+
+
+def test_depth_is_sought_behind_a_fence_too() -> None:
+    """Before all of what is there."""
+    view = inside(0)[0]
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 20), np.linspace(-0.5, 0.5, 20))
+    fence, hill = (
+        np.stack([x * z * 1.2, y * z, np.full_like(x, z)], axis=-1).reshape(-1, 3)
+        for z in (1.0, 20.0)
+    )
+    points = np.concatenate([fence, hill]) @ view.world_from_camera[:, :3].T + view.center
+    depths, seen = seen_before_others(view, points)
+    assert depths[seen].max() < 1.1
+    limits = depth_range(view, points)
+    assert limits is not None
+    assert limits[0] < 1.0
+    assert limits[1] > 20.0
