@@ -114,7 +114,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="train",
-        version=10,
+        version=11,
         after=("depth",),
         reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.train:run",

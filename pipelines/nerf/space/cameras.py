@@ -56,6 +56,11 @@ def panorama_intrinsics(width: int, height: int) -> tuple[tuple[float, float], t
     return (width / 2, float(height)), (width / 2, height / 2)
 
 
+_USUAL_PERCENT, _FAR = 90, 3.0
+"""Cameras so many times as far from the middle one as that share of them are apart from the
+others."""
+
+
 @dataclass(frozen=True)
 class SceneTransform:
     """scene = scale * (world - center). Rotation is the identity.
@@ -72,6 +77,9 @@ class SceneTransform:
     def fit(cls, camera_centers: ArrayLike, *, scale_poses: bool = True) -> SceneTransform:
         """Centred on the mean camera, with all cameras in [-1, 1]^3 where `scale_poses`.
 
+        But for some in a hundred that are farther from all others than thrice what nine in ten
+        are: one picture of the whole, or one wrong pose, would leave no detail to the rest.
+
         camera_centers: [N, 3], world units. Raises NerfError `bad_cameras` unless finite.
         """
         centers = np.asarray(camera_centers, dtype=np.float64).reshape(-1, 3)
@@ -79,6 +87,8 @@ class SceneTransform:
             raise NerfError(
                 "bad_cameras", "There is no camera centre, or one is not finite.", "Check poses."
             )
+        away = np.abs(centers - np.median(centers, axis=0)).max(axis=1)
+        centers = centers[away <= _FAR * np.percentile(away, _USUAL_PERCENT)]
         center = centers.mean(axis=0)
         reach = float(np.abs(centers - center).max())
         scale = 1.0 / reach if scale_poses and reach > 0.0 else 1.0

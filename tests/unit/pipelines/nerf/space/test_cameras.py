@@ -309,6 +309,23 @@ def test_scene_transform_keeps_millimetres_at_geographic_offsets() -> None:
     assert np.allclose(scene.world_from_scene(scene.scene_from_world(centers)), centers)
 
 
+@pytest.mark.parametrize("away", [2.5, 10.0, 60.0])
+def test_one_camera_far_away_takes_no_detail_from_the_others(away: float) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(30)], axis=1)
+    far = ring.copy()
+    far[7] *= away
+    scene = SceneTransform.fit(far)
+    inside = np.abs(scene.scene_from_world(far)).max(axis=1) <= 1.0 + 1e-9
+    if away < 3.0:
+        assert inside.all()
+    else:
+        assert np.flatnonzero(~inside).tolist() == [7]
+        assert scene.scale == pytest.approx(SceneTransform.fit(ring).scale, rel=0.05)
+    with_two = np.concatenate([ring, 5.0 * ring[:4]])
+    assert np.abs(SceneTransform.fit(with_two).scene_from_world(with_two)).max() <= 1.0 + 1e-9
+
+
 def test_scene_of_cameras_in_one_place_keeps_its_scale() -> None:
     assert SceneTransform.fit(np.ones((3, 3))) == SceneTransform((1.0, 1.0, 1.0), 1.0)
 
