@@ -28,6 +28,8 @@ Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 BY_CUTS = "masks"
 """What `depth` says that a blank ground was told by where masks cut the pictures out."""
+_ABOUT = 0.9
+"""Cosine between up by level pictures and +Z, from which they are believed."""
 Look = Callable[[StereoView, Bytes], Bools]
 """What of a view's picture, [H, W, 3] sRGB, is nothing: [H, W]."""
 
@@ -45,13 +47,17 @@ def up_and_points(workspace: Workspace, capture: CamerasFile) -> tuple[Floats, F
 
 
 def up_of_world(capture: CamerasFile) -> Floats:
-    """Up, [3], unit: +Z, as `ingest` or `poses` have turned the world; as its pictures have it
-    where nobody did. Pictures that are stored on their side would tell less of it.
+    """Up, [3], unit: about +Z, as `ingest` or `poses` have turned the world, by a quarter perhaps;
+    as its pictures have it, if they are level to that or nobody turned it. Those that are stored on
+    their side may be level to something else.
     """
-    if capture.notes.get("up_from") != "none":
+    told = capture.notes.get("up_from")
+    if told == "measured":
         return np.array([0.0, 0.0, 1.0])
-    up, _ = find_up(np.array([image.world_from_camera for image in capture.images], np.float64))
-    return up
+    poses = np.array([image.world_from_camera for image in capture.images], np.float64)
+    up, seen_by = find_up(poses)
+    is_level = seen_by in ("vertical", "sideways") and up[2] >= _ABOUT
+    return up if is_level or told == "none" else np.array([0.0, 0.0, 1.0])
 
 
 def void_masks(

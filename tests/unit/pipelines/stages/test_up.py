@@ -38,6 +38,12 @@ def test_pictures_on_their_side_leave_the_world_as_it_is(every: int) -> None:
     assert up(poses)[2] > 0.98
 
 
+def test_level_pictures_tell_it_better_than_a_world_turned_by_quarters() -> None:
+    tilted = np.array([[1.0, 0.0, 0.0], [0.0, 0.99, -0.14], [0.0, 0.14, 0.99]]) @ arc()
+    assert up(tilted) @ [0.0, -0.14, 0.99] > 0.998
+    assert up(tilted, up_from="measured")[2] == 1.0
+
+
 def test_a_world_of_no_orientation_is_told_by_its_pictures_alone() -> None:
     tilted = np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6], [0.0, 0.6, 0.8]]) @ arc()
     assert up(tilted, up_from="none") @ [0.0, -0.6, 0.8] > 0.98
