@@ -28,6 +28,7 @@ from pipelines.sfm.given_depth import Beside
 from pipelines.sfm.given_fit import Fit, fit_of
 from pipelines.sfm.given_lenses import LensTrial, objection, with_lenses
 from pipelines.sfm.given_pairs import near_pairs, overlapping_pairs, sampled_pairs
+from pipelines.sfm.given_readings import Reading, other_readings
 from pipelines.sfm.given_refinement import NothingFits, Refined, located, refine
 from pipelines.sfm.given_scale import Scale, scaled, weighed
 from pipelines.sfm.pairs import Pairs
@@ -55,17 +56,12 @@ MOST_SPREAD = 1.15
 """How many times as much points may deviate from the sensor's depth as they did before."""
 FEW_FEATURES, NUM_PROBES = 500, 5
 """Features of the median of so many images below which images are doubled to find more."""
-_LOST = 0.5
-"""Agreement of an image's own pairs, in that of the median image, below which its pose is
-suspected."""
 _FINE = 0.7
 _DRIFTED, _AHEAD = 0.35, 2.0
 """Agreement from which poses are read by another convention: `_FINE`; or that of poses that drift,
 if it is so many times that of any other reading."""
 _WRONG = 0.25
 """Agreement up to which poses have nothing to do with the pictures: drift leaves more."""
-_USUAL = 0.6
-"""And that of the median image from which this can be told from drift."""
 _BASE_S, _PER_IMAGE_S = 300.0, 5.0
 """Seconds after which refinement gives up: many times what it takes on a machine of two cores."""
 _LOCATING_S, _LOCATING_PER_IMAGE_S, _MOST_LOCATING_S = 60.0, 1.0, 1800.0
@@ -478,26 +474,6 @@ def reach(given: Floats, refined: Refined) -> float:
     return max(extent, float(np.median(np.linalg.norm(points - middle, axis=1))), 1e-12)
 
 
-def suspects(fit: Fit | None) -> list[int]:
-    """Images whose matches contradict their poses far more than others' do.
-
-    One after the other, the worst first, and the others are judged without its pairs: whoever
-    looks at a picture that has another one's pose seems to lie, too.
-    """
-    found: list[int] = []
-    if fit is None or np.isnan(fit.of_image()).all():
-        return found
-    usual = float(np.nanmedian(fit.of_image()))
-    if usual < _USUAL:
-        return found
-    while True:
-        of_image = np.nan_to_num(fit.of_image(found), nan=np.inf)
-        worst = int(of_image.argmin())
-        if not of_image[worst] < _LOST * usual:
-            return sorted(found)
-        found.append(worst)
-
-
 def rated(judged: Judged, fit: Fit) -> Judged:
     """With poses that fit the sample so: trusted, or kept until they are refined."""
     why = f"matches miss them by {fit.error_px:.2f} px"
@@ -505,39 +481,6 @@ def rated(judged: Judged, fit: Fit) -> Judged:
         why = f"{why}, as those of exact poses do"
         return replace(judged, verdict="trusted", why=why, sampled=fit)
     return replace(judged, verdict="kept", why=why, sampled=fit)
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What poses would be if they had been written by another convention: its words; poses
-    [N, 3, 4], OpenCV axes. is_whole: whether each picture has one so."""
-
-    words: str
-    poses: Floats
-    is_whole: bool = True
-
-
-def other_readings(poses: Floats) -> list[Reading]:
-    """How else poses may be read. poses: [N, 3, 4] as they were sent, OpenGL axes."""
-    flip = np.diag([1.0, -1.0, -1.0])
-
-    def flipped(all_poses: Floats) -> Floats:
-        return np.concatenate([all_poses[:, :, :3] @ flip, all_poses[:, :, 3:]], axis=2)
-
-    def inverted(all_poses: Floats) -> Floats:
-        turned = all_poses[:, :, :3].transpose(0, 2, 1)
-        return np.concatenate([turned, -turned @ all_poses[:, :, 3:]], axis=2)
-
-    axes = "their cameras' axes are the others of OpenCV's (Y down, looking along +Z) and OpenGL's"
-    inverse = "they lead from the world to the camera, not from the camera to the world"
-    after, before = (flipped(np.roll(poses, shift, axis=0)) for shift in (-1, 1))
-    return [
-        Reading(axes, poses),
-        Reading(inverse, flipped(inverted(poses))),
-        Reading(inverse, inverted(flipped(poses))),
-        Reading("each belongs to the picture after", after, is_whole=False),
-        Reading("each belongs to the picture before", before, is_whole=False),
-    ]
 
 
 def _words(error: BaseException) -> str:

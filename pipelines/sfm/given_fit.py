@@ -29,6 +29,11 @@ FEWEST_MATCHES, FEWEST_PAIRS = 12, 3
 _FULL_WEIGHT = 60
 _TELLING_PAIRS = 2
 """Of an image, that say anything of it alone: one pair has two images."""
+_LOST = 0.5
+"""Agreement of an image's own pairs, in that of the median image, below which its pose is
+suspected."""
+_USUAL = 0.6
+"""And that of the median image from which this can be told from drift."""
 
 
 @dataclass(frozen=True)
@@ -122,3 +127,23 @@ def px_scale(lenses: Sequence[Intrinsics], long_side_px: int) -> float:
             ]
         )
     )
+
+
+def suspects(fit: Fit | None) -> list[int]:
+    """Images whose matches contradict their poses far more than others' do.
+
+    One after the other, the worst first, and the others are judged without its pairs: whoever
+    looks at a picture that has another one's pose seems to lie, too.
+    """
+    found: list[int] = []
+    if fit is None or np.isnan(fit.of_image()).all():
+        return found
+    usual = float(np.nanmedian(fit.of_image()))
+    if usual < _USUAL:
+        return found
+    while True:
+        of_image = np.nan_to_num(fit.of_image(found), nan=np.inf)
+        worst = int(of_image.argmin())
+        if not of_image[worst] < _LOST * usual:
+            return sorted(found)
+        found.append(worst)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.sfm.agreement import LITTLE
-from pipelines.sfm.given import Judged, Posed, movement, suspects
-from pipelines.sfm.given_fit import Fit
+from pipelines.sfm.given import Judged, Posed, movement
+from pipelines.sfm.given_fit import Fit, suspects
 from pipelines.sfm.given_lenses import TELLING, LensTrial
 from pipelines.sfm.given_scale import Scale
 

@@ -147,12 +147,7 @@ def _settings(options: PosesOptions, ctx: StageContext) -> FeatureSettings:
 
 def _write(found: GivenPoses, ctx: StageContext) -> None:
     """cameras.json and points.ply of the poses to hand on."""
-    root, judged, posed, cameras = (
-        ctx.workspace.stage("ingest"),
-        found.judged,
-        found.posed,
-        found.cameras,
-    )
+    root, judged, cameras = ctx.workspace.stage("ingest"), found.judged, found.cameras
     refined = judged.refined if judged.verdict == "refined" else None
     move = None
     if refined is None and not judged.is_reread:
@@ -178,7 +173,7 @@ def _write(found: GivenPoses, ctx: StageContext) -> None:
                 if image.depth and judged.depth_by_given_lens
                 else image.depth_lens,
             )
-            for image, given, pose in zip(cameras.images, posed.lenses, poses, strict=True)
+            for image, given, pose in zip(cameras.images, found.posed.lenses, poses, strict=True)
         )
         changed = replace(cameras, cameras=tuple(lenses), images=images, notes=notes)
         changed.save(ctx.out / "cameras.json")

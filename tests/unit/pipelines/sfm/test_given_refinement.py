@@ -6,8 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipelines.scene.cameras_file import Intrinsics
-from pipelines.sfm.given import suspects
-from pipelines.sfm.given_fit import fit_of
+from pipelines.sfm.given_fit import fit_of, suspects
 from pipelines.sfm.given_pairs import overlapping_pairs, sampled_pairs
 from pipelines.sfm.given_refinement import carried, onto, refine, settled, shared, tolerances
 from pipelines.sfm.tracks import Observations, build_tracks, thinned, triangulate

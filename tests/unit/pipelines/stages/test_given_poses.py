@@ -10,125 +10,35 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
-from pipelines.captures.record import CaptureRecord
-from pipelines.errors import Cancelled, PosesError, ToolError
+from pipelines.errors import Cancelled, ToolError
 from pipelines.exports.formats.ply import read_ply, write_points
-from pipelines.manifest import run_stage
-from pipelines.options import PosesOptions
-from pipelines.registry import get_stage
-from pipelines.sample.align import path_extent, similarity
-from pipelines.scene.cameras_file import CamerasFile, Intrinsics, PosedImage
-from pipelines.scene.sensor_depth import save_sensor_depth
+from pipelines.sample.align import similarity
+from pipelines.scene.cameras_file import CamerasFile
 from pipelines.sfm import given
 from pipelines.sfm.given_depth import Beside
-from pipelines.stage import StageContext
 from pipelines.stages import given_poses
-from pipelines.stages import poses as poses_stage
 from pipelines.stages.poses import run
 from pipelines.tools.colmap import Reconstructor
-from pipelines.workspace import MANIFEST, Workspace
-from tests.unit.pipelines.sfm.synthetic_room import FOCAL, HEIGHT, WIDTH, arc_poses, render
-
-NUM, FEW = 16, 7
-TRUTH = arc_poses(NUM)
-EXTENT = path_extent(TRUTH[:, :, 3])
-OPTIONS = PosesOptions(num_features=1500, max_image_px=400, upsample="off", num_threads=2)
-Poses = np.ndarray
+from tests.unit.pipelines.sfm.synthetic_room import FOCAL, HEIGHT, WIDTH, render
+from tests.unit.pipelines.stages.posed_room import (
+    EXTENT,
+    FEW,
+    NUM,
+    OPTIONS,
+    TRUTH,
+    assert_as_given,
+    codes,
+    context,
+    drifted,
+    errors,
+    found,
+)
 
 
 @pytest.fixture(scope="module")
 def pictures() -> list[Image.Image]:
     return [render(pose) for pose in TRUTH]
-
-
-def drifted(centers: float = 0.015, turns_deg: float = 1.0) -> Poses:
-    """The truth, off by up to so much of its extent and so many degrees, smoothly along the way."""
-    along = np.linspace(0.0, 2 * np.pi, NUM)
-    waves = np.stack([np.sin(along), np.cos(1.3 * along + 1.0), np.sin(0.7 * along + 2.0)], 1)
-    poses = TRUTH.copy()
-    poses[:, :, :3] = (
-        Rotation.from_rotvec(np.radians(turns_deg) * waves[:, ::-1]).as_matrix() @ (TRUTH[:, :, :3])
-    )
-    poses[:, :, 3] += centers * EXTENT * waves
-    return poses
-
-
-def context(
-    root: Path,
-    poses: Poses,
-    pictures: list[Image.Image],
-    *,
-    depth: float = 0.0,
-    metric: bool = True,
-    focal: float = FOCAL,
-    depth_focal: float = FOCAL,
-    is_stated: bool = False,
-    **more: Any,
-) -> StageContext:
-    """A capture as `ingest` leaves it. depth: with a sensor's depth, of that scale. metric: whether
-    its poses are in metres. focal: what it says of its lens. depth_focal: of the depth's, which it
-    says as well if `is_stated`."""
-    folder = Workspace(root).stage("ingest")
-    (folder / "images").mkdir(parents=True)
-    (folder / "depth").mkdir()
-    lens = Intrinsics(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2)
-    images = []
-    for index, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
-        file, depth_file = f"images/{index:05d}.jpg", f"depth/{index:05d}.npz"
-        picture.save(folder / file, quality=95)
-        if depth:
-            z = depth * true_depth(TRUTH[index], depth_focal)
-            save_sensor_depth(folder / depth_file, z.astype(np.float32))
-        rows = tuple(tuple(float(value) for value in row) for row in pose)
-        own = replace(lens, fl_x=depth_focal, fl_y=depth_focal) if is_stated else None
-        images.append(
-            PosedImage(file, 0, rows, depth=depth_file if depth else None, depth_lens=own)
-        )
-    CamerasFile((lens,), tuple(images), metric=metric, source="nerfstudio").save(
-        folder / "cameras.json"
-    )
-    out = root / ".partial" / "poses"
-    out.mkdir(parents=True)
-    return StageContext("poses", Workspace(root), out, Workspace(root).checkpoint("poses"), **more)
-
-
-def true_depth(pose: Poses, focal: float = FOCAL) -> np.ndarray:
-    """[75, 100] of the room, along the camera's axis."""
-    u, v = np.meshgrid((np.arange(100) + 0.5) * 4, (np.arange(75) + 0.5) * 4)
-    local = np.stack(
-        [(u - WIDTH / 2) / focal, -(v - HEIGHT / 2) / focal, -np.ones_like(u)], axis=-1
-    )
-    rays = local @ pose[:, :3].T
-    with np.errstate(divide="ignore"):
-        return np.where(rays < 0, -pose[:, 3] / rays, np.inf).min(axis=-1)
-
-
-def found(ctx: StageContext) -> Poses:
-    images = CamerasFile.load(ctx.out / "cameras.json").images
-    return np.array([image.world_from_camera for image in images])
-
-
-def errors(poses: Poses) -> tuple[float, float]:
-    """Of centres, as a share of the extent, and of turns in degrees, means after the best
-    similarity."""
-    truth = TRUTH[: len(poses)]
-    move = similarity(poses[:, :, 3], truth[:, :, 3])
-    centers = np.linalg.norm(move.apply_to_points(poses[:, :, 3]) - truth[:, :, 3], axis=1)
-    turned = move.apply_to_cameras(poses)[:, :, :3]
-    cosines = ((turned * truth[:, :, :3]).sum((1, 2)) - 1) / 2
-    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return float(centers.mean() / EXTENT), float(angles.mean())
-
-
-def assert_as_given(ctx: StageContext) -> None:
-    given_bytes = (ctx.workspace.stage("ingest") / "cameras.json").read_bytes()
-    assert (ctx.out / "cameras.json").read_bytes() == given_bytes
-
-
-def codes(summary: dict[str, Any]) -> list[str]:
-    return [warning["code"] for warning in summary["warnings"]]
 
 
 def test_exact_poses_are_trusted_and_stay_as_they_are(
@@ -372,167 +282,6 @@ def test_two_mixed_up_rows_are_named_where_poses_are_to_be_trusted(
     assert warning["code"] == "given_poses_contradicted"
     assert "00011" in warning["message"]
     assert warning["details"]["files"] == ["images/00004.jpg", "images/00011.jpg"]
-    assert_as_given(ctx)
-
-
-OTHER_AXES = np.array([1.0, -1.0, -1.0, 1.0])
-
-
-def test_poses_with_axes_of_another_program_are_told_and_stay_where_they_are_to_be_trusted(
-    tmp_path: Path, pictures: list[Image.Image]
-) -> None:
-    ctx = context(tmp_path, TRUTH * OTHER_AXES, pictures)
-    summary = run(OPTIONS.model_copy(update={"given": "trust"}), ctx)
-    (warning,) = summary["warnings"]
-    assert warning["code"] == "given_poses_contradicted"
-    assert "axes" in warning["hint"]
-    assert "would fit if" in warning["hint"]
-    assert summary["given"]["verdict"] == "kept"
-    assert_as_given(ctx)
-
-
-@pytest.mark.parametrize("drift", [0.0, 0.015], ids=["exact", "drifted"])
-def test_poses_with_axes_of_another_program_are_read_by_them(
-    tmp_path: Path, pictures: list[Image.Image], drift: float
-) -> None:
-    num = NUM if drift else FEW
-    poses = drifted(drift, 60.0 * drift)[:num]
-    ctx = context(tmp_path, poses * OTHER_AXES, pictures[:num])
-    summary = run(OPTIONS, ctx)
-    (warning,) = summary["warnings"]
-    assert warning["code"] == "given_poses_reread"
-    assert "axes" in warning["message"]
-    assert summary["given"]["verdict"] == ("refined" if drift else "trusted")
-    assert summary["given"]["written"]["agreement"] < 0.5 < summary["given"]["sampled"]["agreement"]
-    cameras = CamerasFile.load(ctx.out / "cameras.json")
-    assert cameras.metric
-    assert "axes" in cameras.notes["read"]
-    # In the world and at the scale that they came in.
-    assert np.abs(found(ctx) - TRUTH[:num]).max() < (0.02 * EXTENT if drift else 1e-6)
-    off = np.abs(read_ply(ctx.out / "points.ply").points).min(axis=1)
-    assert np.median(off) < (0.02 if drift else 0.002) * EXTENT
-
-
-def inverted(poses: Poses) -> Poses:
-    last = np.tile([[[0, 0, 0, 1.0]]], (len(poses), 1, 1))
-    return np.linalg.inv(np.concatenate([poses, last], 1))[:, :3]
-
-
-def test_inverted_poses_are_told_by_the_world_that_they_came_in() -> None:
-    (reading,) = [
-        reading
-        for reading in given.other_readings(inverted(TRUTH))
-        if np.allclose(reading.poses * OTHER_AXES, TRUTH)
-    ]
-    assert "world to the camera" in reading.words
-
-
-@pytest.mark.parametrize("is_turned", [False, True], ids=["as it came", "turned by its pictures"])
-def test_a_world_that_was_turned_by_wrong_poses_is_turned_anew(
-    tmp_path: Path, pictures: list[Image.Image], is_turned: bool
-) -> None:
-    """`ingest` turned it so that pictures are upright by poses that are the wrong way round."""
-    lying = Rotation.from_euler("x", -90, degrees=True).as_matrix()
-    applied = np.concatenate([lying, [[0.5], [0.25], [-1.0]]], axis=1)
-    num = FEW if is_turned else NUM
-    sent = inverted(TRUTH[:num])
-    moved = applied[:, :3] @ sent
-    moved[:, :, 3] += applied[:, 3]
-    ctx = context(tmp_path, moved, pictures[:num])
-    path = ctx.workspace.stage("ingest") / "cameras.json"
-    notes = {"applied_transform": applied.tolist()} | ({"up": "+Y"} if is_turned else {})
-    replace(CamerasFile.load(path), notes=notes).save(path)
-    summary = run(OPTIONS, ctx)
-    assert codes(summary) == ["given_poses_reread"]
-    cameras = CamerasFile.load(ctx.out / "cameras.json")
-    if is_turned:  # as sent, the room stands
-        assert "applied_transform" not in cameras.notes
-        assert np.abs(found(ctx) - TRUTH[:num]).max() < 1e-6
-    else:  # it is known how it was moved, and seen that it lies
-        whole = np.array(cameras.notes["applied_transform"])
-        back = found(ctx)
-        back[:, :, 3] -= whole[:, 3]
-        assert np.abs(whole[:, :3].T @ back - TRUTH[:num]).max() < 1e-6
-        assert np.allclose(whole[:, :3] @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0])
-    points = read_ply(ctx.out / "points.ply").points - found(ctx)[:, :, 3].mean(0)
-    assert np.linalg.norm(points, axis=1).max() < 10 * EXTENT
-
-
-def scattered() -> Poses:
-    """As many poses that have nothing to do with the pictures."""
-    random, truth = np.random.default_rng(5), TRUTH
-    turned = Rotation.from_rotvec(random.uniform(-1, 1, (NUM, 3))).as_matrix()
-    return np.concatenate(
-        [turned @ truth[::-1, :, :3], truth[:, :, 3:] + random.uniform(-1, 1, (NUM, 3, 1))], 2
-    )
-
-
-def test_poses_of_something_else_are_replaced_by_those_that_pictures_have(
-    tmp_path: Path, pictures: list[Image.Image]
-) -> None:
-    shares: list[float] = []
-    ctx = context(
-        tmp_path, scattered(), pictures, on_progress=lambda share, *_: shares.append(share)
-    )
-    workspace = ctx.workspace
-    images = [{"file": f"images/{index:05d}.jpg", "name": f"{index}.jpg"} for index in range(NUM)]
-    CaptureRecord("nerfstudio", "a.zip", "00", images=images).save(workspace.stage("ingest"))
-    summary = run(OPTIONS, ctx)
-    assert summary["num_registered"] == NUM
-    assert not summary["metric"]
-    centers, turns = errors(found(ctx))
-    assert centers < 0.01
-    assert turns < 0.5
-    report = json.loads((ctx.out / "report.json").read_text())
-    assert len(report["images"]) == NUM
-    assert shares == sorted(shares)
-    assert summary["given"]["verdict"] == report["given"]["verdict"] == "replaced"
-    assert codes(summary) == codes(report) == ["given_poses_replaced"]
-    assert summary["given"]["sampled"]["agreement"] < 0.5
-    ctx.out.rename(workspace.stage("poses"))
-    for stage in ("ingest", "poses"):
-        manifest: dict[str, Any] = {
-            "content": stage,
-            "summary": {},
-            "timings": {},
-            "options": {},
-            "files": [],
-        }
-        (workspace.stage(stage) / MANIFEST).write_text(json.dumps(manifest))
-    told = run_stage(get_stage("check"), {}, workspace)["summary"]
-    assert "given_poses_replaced" in told["findings"]
-    assert told["verdict"] == "usable"
-
-
-def test_poses_that_are_to_be_ignored_are_not_looked_at(
-    tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(poses_stage, "_found", lambda options, ctx: {"num_registered": FEW})
-    monkeypatch.setattr(poses_stage, "judge_given", None)
-    ctx = context(tmp_path, TRUTH[:FEW], pictures[:FEW])
-    assert run(OPTIONS.model_copy(update={"given": "ignore"}), ctx) == {"num_registered": FEW}
-
-
-def test_poses_that_none_are_better_than_stay(
-    tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def none(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
-        for name in ("cameras.json", "points.ply"):
-            (ctx.out / name).write_text("of another attempt")
-        return {"agreement": 0.4, "registered_ratio": 1.0}
-
-    ctx = context(tmp_path / "doubtful", scattered()[:FEW], pictures[:FEW])
-    monkeypatch.setattr(poses_stage, "_found", none)
-    assert codes(run(OPTIONS, ctx)) == ["given_poses_contradicted"]
-    assert_as_given(ctx)
-    assert not (ctx.out / "points.ply").exists()
-
-    def fails(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
-        raise PosesError("no", code="no_parallax", hint="")
-
-    ctx = context(tmp_path / "failed", scattered()[:FEW], pictures[:FEW])
-    monkeypatch.setattr(poses_stage, "_found", fails)
-    assert codes(run(OPTIONS, ctx)) == ["given_poses_contradicted"]
     assert_as_given(ctx)
 
 
