@@ -2,17 +2,17 @@
 
 Points near the job's mesh are laid on it, as all views and the photos have made that, and wear its
 picture; where views left gaps on it they are filled; where it has nothing points stay where their
-view has them. In one frame, the world of cameras.json unless another is asked for, in the formats
-asked for. Normals point to the cameras that saw the points. Views are spread over the capture and
-just large enough for the points wanted, so the work is known beforehand and an empty crop ends in
-an error instead of a search without end.
+view has them, if the photos have them there, too. In one frame, the world of cameras.json unless
+another is asked for, in the formats asked for. Normals point to the cameras that saw the points.
+Views are spread over the capture and just large enough for the points wanted, so the work is known
+beforehand and an empty crop ends in an error instead of a search without end.
 """
 
 from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -29,13 +29,16 @@ if TYPE_CHECKING:
     from pipelines.exports.placement import Placement
     from pipelines.exports.surface.cloud import Cloud
     from pipelines.exports.surface.skin import Skin
-    from pipelines.scene.cameras_file import CamerasFile
+    from pipelines.scene.cameras_file import CamerasFile, PosedImage
+    from pipelines.scene.stereo_views import ColorView
     from pipelines.scene.trained_scene import TrainedScene
 
 _MAX_VIEWS = 48
 _RENDER_SHARE = 0.75
 _NORMAL_NEIGHBOURS = 40
 """With 60 normals are a little smoother still, but more of them are off by 30 degrees and more."""
+_AGAINST_PHOTOS, _PHOTO_PX = "checking points against the photos", 320
+"""Their long side: coarser than the points, so that a small error of a pose does not matter."""
 _LEAST_SHARE = 0.05
 """Of a crop's upright box, if hardly any surface in it is in the crop."""
 
@@ -73,7 +76,7 @@ class PointcloudOptions(CropOptions):
     snap_to_mesh: bool = Field(
         True,
         description="Lay points within two voxels of the job's mesh on it, with its normals and "
-        "its picture's colours, and fill gaps on it.",
+        "its picture's colours, fill gaps on it, and drop points off it that photos do not have.",
     )
 
     @field_validator("formats")
@@ -100,6 +103,7 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
     from pipelines.exports.subject_search import SEARCH_SHARE, search_subject
     from pipelines.exports.surface import cloud as clouds
     from pipelines.exports.surface.snapping import snapped
+    from pipelines.exports.surface.strays import strays
     from pipelines.exports.surface.surface_file import load_surface
     from pipelines.exports.surface.views import (
         known_depths,
@@ -156,6 +160,11 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         cloud = cloud.take(inside(cloud.points))
         ctx.progress(0.8, f"checking {len(cloud)} points against all views")
         cloud = cloud.take(consistent(cloud.points, store))
+    if surface is not None:
+        loose = np.flatnonzero(~cloud.normals.any(axis=1))
+        photos = _photos(scene, images, ctx, ctx.told_part(_AGAINST_PHOTOS, 0.84, 0.87))
+        lost = strays(cloud.points[loose], cloud.colors[loose], surface, photos)
+        cloud = cloud.take(np.setdiff1d(np.arange(len(cloud)), loose[lost]))
     if options.remove_outliers:
         ctx.progress(0.87, "removing outliers")
         inner = near.contains(cloud.points)
@@ -204,6 +213,24 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         "crop": told_crop,
         "bounds": bounds.as_dict(),
     }
+
+
+def _photos(
+    scene: TrainedScene,
+    images: list[PosedImage],
+    ctx: StageContext,
+    on_progress: Callable[[float], None],
+) -> Iterator[ColorView]:
+    """The images, small. on_progress: told the share that is done; may raise."""
+    from pipelines.nerf.ahead import each_ahead
+    from pipelines.scene.stereo_views import color_view
+
+    def load(image: PosedImage) -> ColorView:
+        return color_view(ctx.workspace.images_root, image, scene.lens_of(image), _PHOTO_PX)
+
+    for done, photo in enumerate(each_ahead(load, images)):
+        on_progress(done / len(images))
+        yield photo
 
 
 def _skin(ctx: StageContext) -> Skin | None:
@@ -258,8 +285,8 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=13,
-    reads=("ingest", "depth", "mesh"),
+    version=14,
+    reads=("ingest", "frames", "depth", "mesh"),
     run=run,
     options=PointcloudOptions,
     artifacts=(
