@@ -158,7 +158,7 @@ class PosesOptions(StageOptions):
         ge=0,
         le=1,
         description="Below this share of registered images, poses are sought again, thoroughly: "
-        "all pairs, then lower thresholds.",
+        "larger pictures and more pairs, then all pairs with lower thresholds.",
     )
     few_photos: int = Field(
         40,

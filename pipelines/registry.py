@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=18,
+        version=19,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",

@@ -32,7 +32,7 @@ from pipelines.sfm.key_frames import (
     placing_pairs,
 )
 from pipelines.sfm.mending import mended
-from pipelines.sfm.pairs import Pairs, choose_matcher, planned_pairs
+from pipelines.sfm.pairs import Pairs, choose_matcher, pairs_through_others, planned_pairs
 from pipelines.sfm.progress import ProgressScale, Span
 from pipelines.sfm.report import Attempt, Outcome, check_features
 from pipelines.sfm.retrieval import (
@@ -42,7 +42,14 @@ from pipelines.sfm.retrieval import (
     pairs_across,
     retrieval_pairs,
 )
-from pipelines.sfm.rungs import MAX_ALL_PAIRS, RUNGS, Matches, Rung, Standing
+from pipelines.sfm.rungs import (
+    FEW_ENOUGH_FOR_ALL,
+    MAX_ALL_PAIRS,
+    RUNGS,
+    Matches,
+    Rung,
+    Standing,
+)
 from pipelines.sfm.source import Source, camera_groups
 from pipelines.sfm.turning import focal_of_turning, is_turning
 from pipelines.sfm.wide_lenses import probing_pairs, recognised
@@ -75,6 +82,11 @@ _CHOSEN, _MAPPED, _TIDIED, _PLACED = 0.05, 0.4, 0.8, 0.96
 """Where between those two key frames are chosen, where in the rest they are mapped, where between
 that and the fourth all images are placed, and where in the rest the model is complete."""
 
+_LED_TO = 0.35
+"""What pairs that others lead to take of the matching's part."""
+
+TRANSITIVE = "transitive"
+"""The matcher that has pairs lead to others."""
 KEY_FRAMES = "key frames"
 """The matcher of a film that is mapped by some of its frames."""
 _ENOUGH_KEYS = 0.5
@@ -156,11 +168,14 @@ class Ladder:
         )
 
     def _matcher(self, wanted: Matches) -> str:
-        """How this rung's pairs are chosen: key frames, sequential, exhaustive or retrieval."""
+        """How this rung's pairs are chosen: key frames, sequential, exhaustive, retrieval or
+        transitive."""
         num = len(self._source.files)
         if wanted.key_frames:
             return KEY_FRAMES
-        if wanted.all_pairs and num <= MAX_ALL_PAIRS:
+        if wanted.reach == "led" and num > FEW_ENOUGH_FOR_ALL:
+            return TRANSITIVE
+        if wanted.reach != "planned" and num <= MAX_ALL_PAIRS:
             return "exhaustive"
         return choose_matcher(num, self._options.matcher, is_video=self._source.is_video)
 
@@ -203,6 +218,10 @@ class Ladder:
         if matcher == "retrieval":
             return retrieval_pairs(self._vectors(), options.retrieval_neighbours)
         clips = self._source.stretches
+        if matcher == TRANSITIVE:
+            planned = choose_matcher(num, options.matcher, is_video=self._source.is_video)
+            alike = retrieval_pairs(self._vectors(), options.retrieval_neighbours)
+            return sorted({*alike, *([] if planned == "retrieval" else self._pairs(planned))})
         pairs = planned_pairs(num, matcher, options.sequential_overlap, clips)
         if matcher == "sequential" and len(clips) > 1:
             # Nothing but looks tells where two clips show the same.
@@ -282,8 +301,16 @@ class Ladder:
             self._ctx.logger.info("%s matches are in the checkpoint", step)
             return
         pairs = self._pairs_by_keys(keys) if keys else self._pairs(matcher)
-        watch = self._progress.watch(span, len(pairs), "matching pair")
+        is_led = matcher == TRANSITIVE
+        start, end = span
+        planned = end - (_LED_TO * (end - start) if is_led else 0.0)
+        watch = self._progress.watch((start, planned), len(pairs), "matching pair")
         self._reconstructor.match(pairs, watch, thorough=wanted.thorough)
+        if is_led:
+            further = pairs_through_others(self._reconstructor.statistics().verified, pairs)
+            self._ctx.logger.info("%d pairs lead to %d more", len(pairs), len(further))
+            watch = self._progress.watch((planned, end), len(further), "matching further pair")
+            self._reconstructor.match(further, watch, thorough=wanted.thorough)
         self._checkpoint.save(step)
 
     def _start_focals(self) -> None:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+
+import numpy as np
+import numpy.typing as npt
 
 Pairs = list[tuple[int, int]]
 
@@ -11,6 +16,8 @@ MAX_EXHAUSTIVE_PHOTOS = 40
 """Photos beyond this are matched with those most like them: at 50 that is half of all pairs."""
 SHORT_SEQUENCE = 30
 """Up to here, all pairs cost no more than a sequence's."""
+LEADING_MATCHES = 30
+"""Verified matches of a pair from which what one image shares with a third the other may, too."""
 
 
 def sequential_pairs(num: int, overlap: int) -> Pairs:
@@ -29,6 +36,22 @@ def spaced_pairs(num: int) -> Pairs:
 def exhaustive_pairs(num: int) -> Pairs:
     """All pairs."""
     return [(i, j) for i in range(num) for j in range(i + 1, num)]
+
+
+def pairs_through_others(
+    verified: npt.NDArray[np.int64], matched: Collection[tuple[int, int]]
+) -> Pairs:
+    """Pairs that were not matched, of images that both show what a third one shows.
+
+    verified: [V, 3], of each verified pair both images, the lower first, and its matches. Those
+    with fewer than 30 lead nowhere. matched: pairs that are not asked for again.
+    """
+    beside: dict[int, set[int]] = defaultdict(set)
+    for i, j in verified[verified[:, 2] >= LEADING_MATCHES, :2].tolist():
+        beside[i].add(j)
+        beside[j].add(i)
+    pairs = {pair for third in beside.values() for pair in itertools.combinations(sorted(third), 2)}
+    return sorted(pairs.difference(matched))
 
 
 def choose_matcher(num: int, matcher: str, *, is_video: bool) -> str:

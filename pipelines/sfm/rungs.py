@@ -8,13 +8,21 @@ one, add a line; nothing else knows their names or their number.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 from pipelines.sfm.key_frames import LONG_FILM
 from pipelines.tools.colmap_settings import MapperSettings, Thresholds
 
 MAX_ALL_PAIRS = 300
-"""Images beyond which `all_pairs` is not done: it would take hours."""
+"""Images beyond which all pairs are not matched: it would take hours."""
+
+FEW_ENOUGH_FOR_ALL = 60
+"""Up to here, all pairs are not many more than what the planned ones lead to."""
+
+Reach = Literal["planned", "led", "all"]
+"""Which pairs are matched: those that are planned; those alike and planned, and what they lead to;
+all of up to MAX_ALL_PAIRS images."""
 
 
 @dataclass(frozen=True)
@@ -23,14 +31,14 @@ class Matches:
 
     database: its name; who shares it shares features, too. key_frames: pairs of key frames, and of
     the others with those around them. doubled: whether images are doubled before features
-    are looked for; False leaves that to `poses.upsample`. all_pairs: of up to MAX_ALL_PAIRS images,
-    instead of the pairs that were planned. thorough: COLMAP's own number of trials for a pair.
+    are looked for; False leaves that to `poses.upsample`. thorough: COLMAP's own number of trials
+    for a pair.
     """
 
     database: str
     key_frames: bool = False
     doubled: bool = False
-    all_pairs: bool = False
+    reach: Reach = "planned"
     thorough: bool = False
 
 
@@ -88,7 +96,8 @@ def too_few_registered(standing: Standing) -> bool:
 
 _KEY_FRAMES = Matches("colmap", key_frames=True)
 _PLANNED = Matches("colmap")
-_ALL = Matches("thorough", doubled=True, all_pairs=True, thorough=True)
+_LED = Matches("thorough", doubled=True, reach="led", thorough=True)
+_ALL = replace(_LED, reach="all")
 _LOW = Thresholds(
     min_num_matches=10,
     init_min_angle_deg=4.0,
@@ -100,7 +109,7 @@ _LOW = Thresholds(
 RUNGS: tuple[Rung, ...] = (
     Rung("key frames", long_film, _KEY_FRAMES, MapperSettings()),
     Rung("quick", not_yet_enough, _PLANNED, MapperSettings()),
-    Rung("thorough", too_few_registered, _ALL, MapperSettings(thorough=True)),
+    Rung("thorough", too_few_registered, _LED, MapperSettings(thorough=True)),
     Rung("relaxed", too_few_registered, _ALL, MapperSettings(thorough=True, thresholds=_LOW)),
 )
 """In the order of climbing; what the first that is tried matched is looked at for a camera that

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pipelines.sfm.pairs import (
     choose_matcher,
     exhaustive_pairs,
+    pairs_through_others,
     planned_pairs,
     sequential_pairs,
     spaced_pairs,
@@ -57,3 +60,12 @@ def test_neighbours_in_time_are_of_one_clip() -> None:
     joining = {(i, j) for i, j in pairs if i < 20 <= j}
     assert joining == {(i, j) for i, j in spaced_pairs(40) if i < 20 <= j}
     assert pairs < set(planned_pairs(40, "exhaustive", 3, clips))
+
+
+def test_what_two_images_share_with_a_third_leads_from_one_to_the_other() -> None:
+    """0 - 1 - 2, and 2 - 3 with too few matches to lead anywhere; 4 shares with 0 and 2."""
+    verified = np.array([[0, 1, 30], [1, 2, 200], [2, 3, 29], [0, 4, 50], [2, 4, 31]], np.int64)
+    matched = {(0, 1), (1, 2), (2, 3), (0, 4), (2, 4), (1, 4)}
+    assert pairs_through_others(verified, matched) == [(0, 2)]
+    assert pairs_through_others(verified, []) == [(0, 2), (1, 4)]
+    assert pairs_through_others(np.zeros((0, 3), np.int64), matched) == []

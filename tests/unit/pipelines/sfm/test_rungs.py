@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from pipelines.options import PosesOptions
+from pipelines.sfm import attempts
 from pipelines.sfm.attempts import Ladder
 from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.rungs import RUNGS, Matches, Rung, Standing, always, too_few_registered
@@ -24,7 +26,7 @@ def test_names_tell_rungs_and_databases_apart() -> None:
     matches = {rung.matches for rung in RUNGS}
     features = {(each.database, each.doubled) for each in matches}
     assert len({database for database, _ in features}) == len(features), "who shares features"
-    steps = {(each.database, each.key_frames, each.all_pairs) for each in matches}
+    steps = {(each.database, each.key_frames, each.reach) for each in matches}
     assert len(steps) == len(matches)
     assert any(rung.when(Standing(10, 0, 0.0)) for rung in RUNGS)
     assert [rung.is_relaxed for rung in RUNGS] == [False, False, False, True]
@@ -33,6 +35,46 @@ def test_names_tell_rungs_and_databases_apart() -> None:
 @pytest.mark.parametrize(("registered", "more"), [(7, True), (8, False), (10, False)])
 def test_the_next_rung_is_for_captures_that_lack_images(registered: int, more: bool) -> None:
     assert too_few_registered(Standing(10, registered, 0.8)) is more
+
+
+def test_pairs_lead_to_others_where_all_would_be_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a film of 16 pictures with one neighbour planned each way, and the most alike."""
+    monkeypatch.setattr(attempts, "FEW_ENOUGH_FOR_ALL", 10)
+    save_video_frames(tmp_path, [render(pose) for pose in arc_poses(16)])
+    workspace = Workspace(tmp_path)
+    ctx = StageContext("poses", workspace, tmp_path, workspace.checkpoint("poses"))
+    options = PosesOptions(
+        num_features=800,
+        max_image_px=400,
+        upsample="off",
+        matcher="sequential",
+        sequential_overlap=1,
+        retrieval_neighbours=1,
+    )
+    source = read_source(workspace)
+    checkpoint = Checkpoint(ctx, source, options)
+    reconstructor = Reconstructor(
+        checkpoint.database("few"), source.paths, tmp_path / "scratch", num_threads=1
+    )
+    numbers = {}
+    for reach in ("planned", "led", "all"):
+        rungs = (Rung(reach, always, Matches(reach, reach=reach), MapperSettings()),)
+        outcome = Ladder(reconstructor, checkpoint, source, options, ctx, rungs).climb()
+        assert outcome.chosen.num_registered == 16
+        numbers[reach] = outcome.statistics.num_pairs
+        assert (
+            outcome.chosen.matcher
+            == {
+                "planned": "sequential",
+                "led": attempts.TRANSITIVE,
+                "all": "exhaustive",
+            }[reach]
+        )
+    assert numbers["planned"] < numbers["led"] < numbers["all"] == 120
+    steps = json.loads((ctx.checkpoint / "state.json").read_text("utf-8"))["steps"]
+    assert "led transitive" in steps
 
 
 def test_one_line_more_is_one_attempt_more_on_the_same_matches(tmp_path: Path) -> None:
