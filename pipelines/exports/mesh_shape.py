@@ -123,7 +123,7 @@ def plan_of(scene: TrainedScene, options: MeshOptions, place: Placement, ctx: St
         options.max_distance,
         reach_of(options),
         options.resolution,
-        Subject(options.fine_distance, max(1.0 / lens.fl_x for lens in lenses), probes),
+        Subject(options.fine_distance, _pixel_of(lenses), probes),
     )
     if not shells:
         raise _empty("no ray of the training views met a surface")
@@ -270,6 +270,13 @@ def _photos(
         told(0.0)
         photos.append(load(ctx.workspace.images_root, image, scene.lens_of(image), side))
     return photos
+
+
+def _pixel_of(lenses: Sequence[Pinhole]) -> float:
+    """What a pixel covers at distance 1: of half of the views; a wide one more is no reason to know
+    less of what the others show.
+    """
+    return float(np.median([1.0 / lens.fl_x for lens in lenses]))
 
 
 def part_of(options: MeshOptions, plan: Plan, surface: Surface, ctx: StageContext) -> Part:

@@ -18,7 +18,7 @@ Cameras that are far away from all others hardly count (`usual_distance`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ Floats = NDArray[np.float64]
 
 _BOX_PERCENTILE = 0.5
 _BOX_MARGIN = 0.05
+_CELLS, _SURE_SHARE = 20, 0.2
 
 
 @dataclass(frozen=True)
@@ -87,12 +88,37 @@ def bounds_of_views(
         surface.append(points[known])
         central.append(points[known & middle])
         depths.append(np.linalg.norm(central[-1] - view.world_from_camera[:, 3], axis=1))
-    return scene_bounds(
+    bounds = scene_bounds(
         poses,
         np.concatenate(surface),
         np.concatenate(central),
         np.concatenate(depths),
         max_distance,
+    )
+    return None if bounds is None else _with_what_many_see(bounds, surface[1:])
+
+
+def _with_what_many_see(bounds: SceneBounds, seen: Sequence[Floats]) -> SceneBounds:
+    """The bounds with what a share of the views see beyond them: a stem is few of all pixels.
+
+    seen: [P, 3] of each view.
+    """
+    near = [part[np.linalg.norm(part - bounds.focus, axis=1) <= bounds.radius] for part in seen]
+    points = np.concatenate(near)
+    cells = np.floor((points - bounds.focus) * (_CELLS / bounds.distance)).astype(np.int64)
+    view = np.repeat(np.arange(len(near)), [len(part) for part in near])
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    pairs = np.unique(np.stack([cell.reshape(-1), view]), axis=1)
+    votes = np.bincount(pairs[0])
+    sure = points[votes[cell.reshape(-1)] >= max(2.0, _SURE_SHARE * len(seen))]
+    if len(sure) == 0:
+        return bounds
+    margin = bounds.distance / _CELLS
+    low, high = sure.min(axis=0) - margin, sure.max(axis=0) + margin
+    return replace(
+        bounds,
+        box_min=np.maximum(np.minimum(bounds.box_min, low), bounds.focus - bounds.radius),
+        box_max=np.minimum(np.maximum(bounds.box_max, high), bounds.focus + bounds.radius),
     )
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from pipelines.scene.cameras_file import Intrinsics
 
@@ -78,12 +79,17 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class DepthView:
-    """rgb: [H, W, 3] uint8, sRGB. z_depth: [H, W] float32, world units, 0 where unknown."""
+    """rgb: [H, W, 3] uint8, sRGB. z_depth: [H, W] float32, world units, 0 where unknown.
+
+    is_partial: whether what is unknown may be anything, as in a map of what could be matched or
+    measured; else nothing stands there.
+    """
 
     lens: Pinhole
     world_from_camera: Floats
     rgb: NDArray[np.uint8]
     z_depth: NDArray[np.float32]
+    is_partial: bool = False
 
     def points(self) -> Floats:
         """[H, W, 3] world positions; meaningless where `z_depth` is 0."""
@@ -105,23 +111,35 @@ class DepthView:
         At a jump a pixel's depth may lie between two surfaces, on neither: such a pixel is the
         farther one of a pair, and so is the first of what lies behind. The last one of what lies
         before stays, or the edges of things would be eaten away. A jump is a step steeper than a
-        surface seen at 84 degrees, and at least 2 % of the depth.
+        surface seen at 84 degrees, and at least 2 % of the depth. Beside what is unknown depth may
+        be wrong, too; but where nothing stands, a thing of a pixel or two has no other pixels.
         """
-        return without_jumps(self.z_depth, 1.0 / min(self.lens.fl_x, self.lens.fl_y))
+        angle = 1.0 / min(self.lens.fl_x, self.lens.fl_y)
+        return without_jumps(self.z_depth, angle, keep_thin=not self.is_partial)
 
 
-def without_jumps(depth: NDArray[np.floating], angle: float) -> Bools:
-    """`DepthView.smooth_mask` of any depth [H, W]. angle: between neighbouring pixels, radians."""
+def without_jumps(depth: NDArray[np.floating], angle: float, *, keep_thin: bool = False) -> Bools:
+    """`DepthView.smooth_mask` of any depth [H, W]. angle: between neighbouring pixels, radians.
+
+    keep_thin: pixels beside unknown ones stay where none that is not lies in the 3x3 around them.
+    """
     limit = max(_SMALLEST_JUMP, _STEEPEST_SLOPE * angle)
-    good = depth > 0
+    known = depth > 0
+    good, inner = known.copy(), known.copy()
     for axis in (0, 1):
         near, far = [slice(None)] * 2, [slice(None)] * 2
         near[axis], far[axis] = slice(None, -1), slice(1, None)
         a, b = depth[tuple(near)], depth[tuple(far)]
-        jump = np.abs(a - b) > limit * np.minimum(a, b)
+        both = known[tuple(near)] & known[tuple(far)]
+        jump = both & (np.abs(a - b) > limit * np.minimum(a, b))
         good[tuple(near)] &= ~jump | (a < b)
         good[tuple(far)] &= ~jump | (b < a)
-    return good
+        inner[tuple(near)] &= known[tuple(far)]
+        inner[tuple(far)] &= known[tuple(near)]
+    inner &= good
+    if keep_thin:
+        inner |= good & ~binary_dilation(inner, np.ones((3, 3), np.bool_))
+    return inner
 
 
 def z_depth_of(
@@ -163,7 +181,7 @@ class ViewStore:
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
-        self._cameras: list[tuple[Pinhole, Floats]] = []
+        self._cameras: list[tuple[Pinhole, Floats, bool]] = []
 
     def __len__(self) -> int:
         return len(self._cameras)
@@ -173,15 +191,16 @@ class ViewStore:
         index = len(self._cameras)
         np.save(self._folder / f"{index:06d}.rgb.npy", view.rgb)
         np.save(self._folder / f"{index:06d}.z.npy", view.z_depth)
-        self._cameras.append((view.lens, view.world_from_camera))
+        self._cameras.append((view.lens, view.world_from_camera, view.is_partial))
 
     def __getitem__(self, index: int) -> DepthView:
-        lens, pose = self._cameras[index]
+        lens, pose, is_partial = self._cameras[index]
         return DepthView(
             lens=lens,
             world_from_camera=pose,
             rgb=np.load(self._folder / f"{index:06d}.rgb.npy"),
             z_depth=np.load(self._folder / f"{index:06d}.z.npy"),
+            is_partial=is_partial,
         )
 
     def __iter__(self) -> Iterator[DepthView]:

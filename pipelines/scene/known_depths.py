@@ -43,7 +43,7 @@ class KnownDepths:
         if index is None:
             return None
         z = resampled(self._maps.read(index).z, self._maps.images[index].lens, view.lens)
-        return replace(view, z_depth=z) if z.any() else None
+        return replace(view, z_depth=z, is_partial=True) if z.any() else None
 
 
 def resampled(z: Depths, lens: Pinhole, wanted: Pinhole) -> Depths:

@@ -138,7 +138,8 @@ def _views(
             ctx.workspace.images_root, image, cameras.cameras[image.camera], lens
         )
         pose = np.asarray(image.world_from_camera, np.float64)
-        store.append(DepthView(lens, pose, picture, maps.read(index).z))
+        z = maps.read(index).z
+        store.append(DepthView(lens, pose, picture, z, is_partial=True))
         ctx.progress(_LOAD_SHARE * done / len(picked), "loading images")
     return store
 

@@ -70,7 +70,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=29,
+    version=30,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

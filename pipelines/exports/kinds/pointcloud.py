@@ -285,7 +285,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=14,
+    version=15,
     reads=("ingest", "frames", "depth", "mesh"),
     run=run,
     options=PointcloudOptions,

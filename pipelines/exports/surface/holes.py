@@ -73,7 +73,8 @@ def hole_limits(
 ) -> Callable[[Floats], Floats]:
     """How large holes may be at points [P, 3]: [P], world units.
 
-    size, max_distance: in the cameras' distances. Beyond the latter it grows as the voxels do.
+    size: in the distances of shells. max_distance: in those of their bounds; beyond it, holes may
+    grow as the voxels do.
     """
 
     def limit_at(points: Floats) -> Floats:
@@ -83,7 +84,7 @@ def hole_limits(
             grown = max(1.0, bounds.radius / (max_distance * bounds.distance))
             # What reaches out of the last one has its size.
             here = ~known & (bounds.contains(points) | (shell is shells[-1]))
-            limits[here] = size * bounds.distance * grown
+            limits[here] = size * shell.distance * grown
             known |= here
         return limits
 

@@ -8,9 +8,13 @@ three times as far and has voxels three times as large, so that from the cameras
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.exports.mesh import TriangleMesh, joined
 from pipelines.exports.surface.clean import clean
@@ -30,6 +34,11 @@ _LEAST_FINER = 1.3
 _LEAST_SEEN = 0.5
 """Of what cameras see, for a subject. Of things that are walked round 0.54 to 0.97 is; 0.25 of a
 room, whose walls got holes and bumps from finer voxels."""
+_WALK = 0.5
+"""Of the cameras' distance to what they look at: where they see less far in the median, they went
+along a way, whose length says nothing of how fine things are."""
+_NOISE_VOXELS, _NOISE = 2.0, 0.02
+"""A view shows a place that its depth is that near to, in voxels or of the depth."""
 _OUTER_FACES = 0.25
 _FUSE_SHARE = 0.75
 
@@ -37,13 +46,20 @@ _FUSE_SHARE = 0.75
 @dataclass(frozen=True)
 class Shell:
     """bounds: with all that inner shells have. voxel: world units. is_far: whether it lies beyond
-    `max_distance`. blocks: where they are known.
+    `max_distance`. blocks: where they are known. looked_from: the cameras' distance to what they
+    see, world units, that of the bounds where it is not told; less on a walk.
     """
 
     bounds: SceneBounds
     voxel: float
     is_far: bool = False
     blocks: Blocks | None = None
+    looked_from: float | None = None
+
+    @property
+    def distance(self) -> float:
+        """From where it was looked at, world units."""
+        return self.bounds.distance if self.looked_from is None else self.looked_from
 
 
 @dataclass(frozen=True)
@@ -74,25 +90,37 @@ def find_shells(
     if inner is None:
         return []
     voxel, reach = inner.longest_side / resolution, max_distance
+    distance = inner.distance
     if subject is not None:
+        # Who walks through a place is near what is seen, however far it goes.
+        distance = min(distance, _usual_depth(subject.views, inner) / _WALK)
+        voxel *= distance / inner.distance
         # Finer ones would hold what one view alone shows, and two have to agree.
-        voxel = max(voxel, subject.pixel * inner.distance * max_distance)
-    shells = [Shell(inner, voxel)]
+        voxel = max(voxel, subject.pixel * distance * max_distance)
+    shells = [Shell(inner, voxel, looked_from=distance)]
     if subject is not None and 0.0 < subject.max_distance < max_distance:
         bounds = bounds_at(subject.max_distance)
-        fine = max(voxel / _FINER, subject.pixel * inner.distance)
+        fine = max(voxel / _FINER, subject.pixel * distance)
         if (
             bounds
             and _LEAST_FINER * fine <= voxel
             and seen_share(subject.views, bounds) >= _LEAST_SEEN
         ):
-            shells.insert(0, Shell(bounds, fine))
+            shells.insert(0, Shell(bounds, fine, looked_from=distance))
     while reach < far_distance:
         reach = min(REACH * reach, far_distance)
         bounds = bounds_at(reach)
         if bounds and bounds.longest_side >= _MIN_GROWTH * shells[-1].bounds.longest_side:
-            shells.append(Shell(bounds, voxel * reach / max_distance, is_far=True))
+            coarse = voxel * reach / max_distance
+            shells.append(Shell(bounds, coarse, is_far=True, looked_from=distance))
     return shells
+
+
+def _usual_depth(views: Sequence[DepthView], bounds: SceneBounds) -> float:
+    """The median depth of what views see within bounds."""
+    depths = [view.z_depth[bounds.mask(view)] for view in views]
+    known = np.concatenate([np.zeros(0, np.float32), *depths])
+    return float(np.median(known)) if len(known) else bounds.distance
 
 
 def seen_share(views: Sequence[DepthView], bounds: SceneBounds) -> float:
@@ -161,9 +189,31 @@ def fuse_shells(
         if index:
             fused = _outside(fused, shells[index - 1].bounds, shell.voxel)
         faces = max(100, int(_OUTER_FACES * max_faces)) if shell.is_far else max_faces
-        pieces.append(clean(fused, shell.bounds, faces, on_cleaned))
+        looks_at = functools.partial(_looks_at, views, voxel=shell.voxel)
+        pieces.append(clean(fused, shell.bounds, faces, on_cleaned, looks_at))
         on_cleaned(1.0)
     return joined([piece for piece in pieces if len(piece.faces)])
+
+
+def _looks_at(
+    views: Iterable[DepthView], points: NDArray[np.floating], *, voxel: float
+) -> NDArray[np.float64]:
+    """[P, 2], how many views show points [P, 3], and how many look through them."""
+    there, through = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        lens = view.lens
+        local = (points - view.world_from_camera[:, 3]) @ view.world_from_camera[:, :3]
+        depth = np.where(local[:, 2] < 0.0, -local[:, 2], np.inf)
+        column = np.floor(lens.fl_x * local[:, 0] / depth + lens.cx)
+        row = np.floor(-lens.fl_y * local[:, 1] / depth + lens.cy)
+        inside = np.isfinite(depth) & (column >= 0) & (column < lens.width)
+        which = np.flatnonzero(inside & (row >= 0) & (row < lens.height))
+        shown = view.z_depth[row[which].astype(int), column[which].astype(int)]
+        beyond = shown - depth[which]
+        margin = np.maximum(_NOISE_VOXELS * voxel, _NOISE * depth[which])
+        through[which] += beyond > margin
+        there[which] += (shown > 0.0) & (np.abs(beyond) <= margin)
+    return np.stack([there, through], axis=1)
 
 
 def _outside(mesh: TriangleMesh, inner: SceneBounds, overlap: float) -> TriangleMesh:

@@ -73,8 +73,11 @@ class Surface:
         self.face_normals: Floats = across / np.maximum(twice, 1e-30)[:, None]
         lift = 0.5 * np.sqrt(0.5 * twice)
         self._lifted_centers = self.centers + lift[:, None] * self.face_normals
-        typical = float(np.median(lift)) if len(lift) else 0.0
-        self._lifted_vertices = vertices + typical * normals
+        # Each by the least of its own faces': outer shells are many times as coarse as inner ones.
+        own = np.full(len(vertices), np.inf)
+        np.minimum.at(own, faces.reshape(-1), np.repeat(lift, 3))
+        own[~np.isfinite(own)] = 0.0
+        self._lifted_vertices = vertices + own[:, None] * normals
         self._sight = Sight(vertices, faces)
 
     def unhindered(self, eye: Floats, faces: NDArray[np.intp]) -> NDArray[np.bool_]:

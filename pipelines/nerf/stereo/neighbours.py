@@ -30,6 +30,8 @@ _HIDDEN = 0.4
 """What share of the points that pictures hold must be behind something for that to be heeded: it
 is .61 and .75 in flats of 4 and 9 rooms, and .00 to .37 in single rooms, outdoors and around
 things, where hardly anything would change."""
+_DIRECTIONS = 8_000_000
+"""From views to points, 24 bytes each: both grow with the number of photos."""
 _NEAR_PERCENTILE, _FAR_PERCENTILE = 1.0, 99.0
 
 
@@ -50,10 +52,15 @@ def choose_neighbours(
     before = np.array([seen_before_others(view, points)[1] for view in views])
     if before.sum() < (1.0 - _HIDDEN) * shown.sum():
         shown = before
-    toward = points[None] - centers[:, None]
-    toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-12)
     facing = axes @ axes.T > np.cos(np.radians(_MAX_AXIS_DEG))
-    scores = pair_scores_fast(toward, shown, facing, best_angle_deg, (_BELOW_DEG, _ABOVE_DEG))
+    scores = np.zeros((len(views), len(views)))
+    for some in _portions(len(points), len(views)):
+        toward = points[None, some] - centers[:, None]
+        toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-12)
+        held = np.ascontiguousarray(shown[:, some])
+        found = pair_scores_fast(toward, held, facing, best_angle_deg, (_BELOW_DEG, _ABOVE_DEG))
+        part = held.sum(axis=1) / np.maximum(shown.sum(axis=1), 1)
+        scores += part[:, None] * found
     chosen = []
     for index, score in enumerate(scores):
         if not shown[index].any():
@@ -62,6 +69,12 @@ def choose_neighbours(
         order = np.argsort(-score, kind="stable")[:count]
         chosen.append([int(other) for other in order if score[other] > _LEAST_SCORE])
     return chosen
+
+
+def _portions(num_points: int, num_views: int) -> list[slice]:
+    """The points in portions whose directions from all views are held at a time."""
+    size = max(1, _DIRECTIONS // max(num_views, 1))
+    return [slice(first, first + size) for first in range(0, num_points, size)]
 
 
 def pair_scores(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pipelines.scene.bounds import scene_bounds
-from tests.unit.pipelines.scene.synthetic_views import look_at, ring
+from pipelines.scene.bounds import bounds_of_views, scene_bounds
+from pipelines.scene.depth_views import DepthView, Pinhole
+from tests.unit.pipelines.scene.synthetic_views import look_at, ring, sphere_view
 
 
 def test_background_beyond_max_distance_is_cut_off() -> None:
@@ -69,3 +72,33 @@ def test_no_surface_means_no_bounds() -> None:
     far = np.full((10, 3), 100.0)
     assert scene_bounds(poses, nothing, nothing, np.zeros(0), 2.0) is None
     assert scene_bounds(poses, far, far, np.full(10, 170.0), 2.0) is None
+
+
+@pytest.mark.parametrize(("num_showing", "is_whole"), [(16, True), (2, False)])
+def test_a_stem_that_many_views_show_is_not_cut_off(num_showing: int, is_whole: bool) -> None:
+    """A ball, and above it a stem of less than half a percent of all pixels, or an error of few."""
+    lens, poses = Pinhole(64, 48, 60.0, 60.0, 32.0, 24.0), ring(16, np.zeros(3), distance=5.0)
+    views = []
+    for index, pose in enumerate(poses):
+        view = sphere_view(lens, pose, np.zeros(3))
+        if index < num_showing:
+            view = _with_stem(view, np.linspace(1.0, 2.5, 200))
+        views.append(view)
+    bounds = bounds_of_views(views, poses, 2.0)
+    assert bounds is not None
+    assert bool(bounds.box_max[2] > 2.4) is is_whole
+    assert bounds.box_max[2] < 2.9
+    assert bounds.box_max[0] < 1.5
+
+
+def _with_stem(view: DepthView, heights: np.ndarray) -> DepthView:
+    """A line upwards from the origin, one pixel wide."""
+    points = np.column_stack([np.zeros((len(heights), 2)), heights])
+    local = (points - view.world_from_camera[:, 3]) @ view.world_from_camera[:, :3]
+    lens, depth = view.lens, -local[:, 2]
+    u = (lens.cx + lens.fl_x * local[:, 0] / depth).astype(int)
+    v = (lens.cy - lens.fl_y * local[:, 1] / depth).astype(int)
+    shown = (v >= 0) & (v < lens.height) & (u >= 0) & (u < lens.width)
+    z = view.z_depth.copy()
+    z[v[shown], u[shown]] = depth[shown]
+    return replace(view, z_depth=z)

@@ -60,6 +60,26 @@ def test_a_piece_hangs_together_by_edges() -> None:
     assert in_large_pieces(vertices, faces[:0]).tolist() == []
 
 
+def test_a_small_piece_stays_where_many_views_show_it_and_few_see_through() -> None:
+    """A wall of two triangles; loose before it, a chip of a hundredth and one of a millionth."""
+    wall = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0.0]])
+    chips = [np.array([[x, 0, 1], [x + s, 0, 1], [x, s, 1.0]]) for x, s in ((1, 1.4), (5, 0.01))]
+    vertices = np.concatenate([wall, *chips])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [7, 8, 9]], np.int32)
+
+    def kept(there: float, through: float) -> list[bool]:
+        def looks_at(points: np.ndarray) -> np.ndarray:
+            assert (points[:, 2] == 1.0).all(), "large ones need no asking"
+            return np.tile([there, through], (len(points), 1))
+
+        return in_large_pieces(vertices, faces, looks_at).tolist()
+
+    assert in_large_pieces(vertices, faces).tolist() == [True, True, False, False]
+    assert kept(9, 2) == [True, True, True, False]
+    assert kept(4, 0) == [True, True, False, False], "few show it"
+    assert kept(9, 5) == [True, True, False, False], "many see through it"
+
+
 def noisy_view(lens: Pinhole, pose: np.ndarray, rng: np.random.Generator) -> DepthView:
     view = sphere_view(lens, pose, CENTER)
     noise = 1.0 + 0.01 * rng.normal(size=view.z_depth.shape)

@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.exports.mesh import TriangleMesh
 from pipelines.exports.surface.shells import Shell, Subject, find_shells, fuse_shells, seen_share
-from pipelines.scene.bounds import bounds_of_views
+from pipelines.scene.bounds import SceneBounds, bounds_of_views
 from pipelines.scene.depth_views import DepthView, Pinhole, ViewStore
 from tests.unit.pipelines.scene.synthetic_views import ring, sphere_view
 
@@ -19,10 +19,10 @@ LENS = Pinhole(160, 120, 75.0, 75.0, 80.0, 60.0)
 WALL = 20.0
 
 
-def room_view(pose: np.ndarray) -> DepthView:
+def room_view(pose: np.ndarray, lens: Pinhole = LENS) -> DepthView:
     """The unit ball and, behind it, the inside of a ball of radius 20."""
-    view = sphere_view(LENS, pose, CENTER)
-    world = LENS.directions() @ pose[:, :3].T
+    view = sphere_view(lens, pose, CENTER)
+    world = lens.directions() @ pose[:, :3].T
     start = pose[:, 3] - CENTER
     a, b = (world**2).sum(axis=-1), (world * start).sum(axis=-1)
     far = (-b + np.sqrt(b * b - a * ((start**2).sum() - WALL**2))) / a
@@ -103,6 +103,35 @@ def test_a_subject_hardly_finer_than_its_surroundings_needs_no_shell(views: View
     assert len(found) == len(plain) + 1
     found = shells_of(views, 12.0, fine_distance=0.0, pixel=pixel)
     assert len(found) == len(plain)
+
+
+@pytest.mark.parametrize(("seen_from", "finer"), [(3.0, 1.0), (1.6, 1.0), (0.3, 5.0)])
+def test_the_length_of_a_walk_makes_nothing_coarse(seen_from: float, finer: float) -> None:
+    """Cameras up to 3 away from the middle that see things `seen_from` before them."""
+    middle = SceneBounds(CENTER, 3.0, 6.0, CENTER - 6.4, CENTER + 6.4)
+    pose = np.column_stack([np.eye(3), CENTER])
+    near = np.full((120, 160), seen_from, np.float32)
+    view = DepthView(LENS, pose, np.zeros((120, 160, 3), np.uint8), near)
+    shell, *_ = find_shells(lambda _: middle, 2.0, 2.0, 128, Subject(0.0, 0.0, [view]))
+    assert shell.voxel == pytest.approx(0.1 / finer)
+    assert shell.distance == pytest.approx(3.0 / finer)
+    wide, *_ = find_shells(lambda _: middle, 2.0, 2.0, 128, Subject(0.0, 0.1, [view]))
+    assert wide.voxel == pytest.approx(0.1 * 3.0 / finer * 2.0), "no less than a pixel at its rim"
+
+
+def test_a_small_ball_in_a_large_room_stays(tmp_path: Path) -> None:
+    """A lamp whose cord is too thin: a fiftieth of a percent of the room, but all views show it."""
+    lens, poses = Pinhole(160, 120, 110.0, 110.0, 80.0, 60.0), ring(16, CENTER)
+    store = ViewStore(tmp_path)
+    for pose in poses:
+        store.append(room_view(pose, lens))
+    seen = list(store)
+    bounds = bounds_of_views(seen, poses, 12.0)
+    assert bounds is not None
+    mesh = fuse_shells(store, [Shell(bounds, 0.2)], 200_000)
+    around = np.linalg.norm(mesh.vertices - CENTER, axis=1)
+    assert (around < 1.3).any(), "the ball is there"
+    assert (around > 15.0).any(), "and the walls"
 
 
 def test_a_room_has_no_subject(views: ViewStore) -> None:

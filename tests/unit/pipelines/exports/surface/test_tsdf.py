@@ -151,6 +151,23 @@ def test_at_a_jump_what_lies_before_keeps_its_edge_and_what_lies_between_goes() 
     assert column.smooth_mask()[:, 0].tolist() == wanted
 
 
+@pytest.mark.parametrize("width", [1, 2, 3, 4])
+@pytest.mark.parametrize("behind", [0.0, 9.0])
+def test_a_thin_thing_stays_whatever_is_behind_it(width: int, behind: float) -> None:
+    """A pole before a wall, or before the sky, where nothing is known."""
+    z = np.full((40, 20), behind, np.float32)
+    z[4:, 8 : 8 + width] = 2.0
+    view = DepthView(
+        Pinhole(20, 40, 80.0, 80.0, 10.0, 20.0),
+        np.eye(4)[:3],
+        np.zeros((40, 20, 3), np.uint8),
+        z,
+    )
+    kept = view.smooth_mask()[6:, 8 : 8 + width]
+    assert kept.any(axis=1).all(), "it has no gaps"
+    assert kept.mean() > (0.99 if width < 3 or behind else 0.3)
+
+
 def test_z_depth_takes_the_median_where_the_expected_depth_was_pulled_away() -> None:
     lens = Pinhole(3, 1, 1.0, 1.0, 1.5, 0.5)
     median = np.array([[2.0, 2.0, 2.0]])

@@ -63,6 +63,36 @@ def test_what_lies_behind_something_is_not_coloured_through_it(tmp_path: Path) -
     assert shown_behind < 0.02
 
 
+def test_coarse_ground_does_not_hide_itself_for_a_fine_thing_on_it() -> None:
+    """What is asked from a little before a face is asked by its own size, whatever others have."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(13.0), np.arange(13.0), indexing="ij")
+    first = (np.arange(12)[:, None] * 13 + np.arange(12)).ravel()
+    ground = np.concatenate(
+        [
+            np.column_stack([first, first + 13, first + 14]),
+            np.column_stack([first, first + 14, first + 1]),
+        ]
+    )
+    places = np.column_stack([x.ravel(), y.ravel(), 0.2 * rng.normal(size=169)])
+    thing = painted_ball.ball()
+    small = 0.01 * (thing.vertices - thing.vertices.mean(axis=0)) + np.array([6.0, 6.0, 5.0])
+    normals = np.tile([0.0, 0.0, 1.0], (169, 1))
+    eye = np.array([6.0, -14.0, 8.0])
+
+    def shown(fine: bool) -> int:
+        parts = (small, thing.faces + 169, thing.normals) if fine else ()
+        surface = Surface(
+            np.concatenate([places, *parts[:1]]),
+            np.concatenate([ground, *parts[1:2]]).astype(np.int32),
+            np.concatenate([normals, *parts[2:]]),
+        )
+        return int(surface.unhindered(eye, np.arange(len(ground))).sum())
+
+    assert len(thing.faces) > 3 * len(ground)
+    assert shown(fine=True) == shown(fine=False) > 0
+
+
 @pytest.mark.parametrize("glance_px", [640, 80])
 def test_a_hand_in_one_photo_is_voted_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, glance_px: int

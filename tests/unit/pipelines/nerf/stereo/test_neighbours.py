@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from pipelines.nerf.stereo import neighbours
 from pipelines.nerf.stereo.neighbours import choose_neighbours, depth_range, seen_before_others
 from pipelines.nerf.stereo.views import StereoView
 
@@ -86,3 +88,16 @@ def test_depth_is_sought_behind_a_fence_too() -> None:
     assert limits is not None
     assert limits[0] < 1.0
     assert limits[1] > 20.0
+
+
+def test_a_few_points_at_a_time_give_the_same_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view of which no portion shows anything among them."""
+    pose = VIEWS[0].world_from_camera.copy()
+    pose[2, 3] = 100.0
+    aside = StereoView(VIEWS[0].picture, LENS, pose)
+    views = [*VIEWS[: 2 * PER_ROOM], aside]
+    whole = choose_neighbours(views, POINTS, 4, 6.0)
+    monkeypatch.setattr(neighbours, "_DIRECTIONS", 700 * len(views))
+    assert len(neighbours._portions(len(POINTS), len(views))) == 11
+    assert choose_neighbours(views, POINTS, 4, 6.0) == whole
+    assert all(whole[: 2 * PER_ROOM])
