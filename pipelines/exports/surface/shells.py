@@ -4,6 +4,7 @@ One shell is the scene's bounds at `max_distance`, with voxels of the asked reso
 one for the subject, if half of what cameras see is that, with voxels half as large: of what lies
 within two camera distances, the thing that is walked round is a tenth. Each further one reaches
 three times as far and has voxels three times as large, so that from the cameras all look alike.
+The cameras' distance is that to what they look at, or, of a walk, twice the depth that they see.
 """
 
 from __future__ import annotations
