@@ -38,13 +38,17 @@ of them have to."""
 
 @dataclass(frozen=True)
 class SceneBounds:
-    """focus: [3]. distance, radius: world units. box_min, box_max: [3], inside the ball's box."""
+    """focus: [3]. distance, radius: world units. box_min, box_max: [3], inside the ball's box.
+
+    widened_by: what the box's longest side has on that of the box of almost all of the surface.
+    """
 
     focus: Floats
     distance: float
     radius: float
     box_min: Floats
     box_max: Floats
+    widened_by: float = 0.0
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """Whether points [..., 3] are part of the scene: [...]."""
@@ -62,6 +66,11 @@ class SceneBounds:
     def longest_side(self) -> float:
         """The longest side of the box."""
         return float(np.max(self.box_max - self.box_min))
+
+    @property
+    def usual_side(self) -> float:
+        """The longest side of what holds almost all of the surface: a stem makes nothing coarse."""
+        return self.longest_side - self.widened_by
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a summary."""
@@ -114,15 +123,17 @@ def _with_what_many_see(bounds: SceneBounds, seen: Sequence[Floats]) -> SceneBou
     pairs = np.unique(np.stack([cell.reshape(-1), view]), axis=1)
     votes = np.bincount(pairs[0])
     sure = points[votes[cell.reshape(-1)] >= max(2.0, _SURE_SHARE * len(seen))]
-    if len(sure) == 0:
+    beyond = sure[~bounds.contains(sure)]
+    if len(beyond) == 0:
         return bounds
     margin = bounds.distance / _CELLS
-    low, high = sure.min(axis=0) - margin, sure.max(axis=0) + margin
-    return replace(
+    low, high = beyond.min(axis=0) - margin, beyond.max(axis=0) + margin
+    wide = replace(
         bounds,
         box_min=np.maximum(np.minimum(bounds.box_min, low), bounds.focus - bounds.radius),
         box_max=np.minimum(np.maximum(bounds.box_max, high), bounds.focus + bounds.radius),
     )
+    return replace(wide, widened_by=wide.longest_side - bounds.longest_side)
 
 
 def scene_bounds(

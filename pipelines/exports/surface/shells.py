@@ -90,7 +90,7 @@ def find_shells(
     inner = bounds_at(max_distance)
     if inner is None:
         return []
-    voxel, reach = inner.longest_side / resolution, max_distance
+    voxel, reach = inner.usual_side / resolution, max_distance
     distance = inner.distance
     if subject is not None:
         # Who walks through a place is near what is seen, however far it goes.

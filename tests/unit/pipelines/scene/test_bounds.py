@@ -88,6 +88,7 @@ def test_a_stem_that_many_views_show_is_not_cut_off(num_showing: int, is_whole: 
     assert bounds is not None
     assert bool(bounds.box_max[2] > 2.4) is is_whole
     assert bounds.box_max[2] < 2.9
+    assert bool(bounds.usual_side < bounds.longest_side - 0.3) is is_whole, "no voxel is coarser"
     assert bounds.box_max[0] < 1.5
 
 

@@ -65,7 +65,7 @@ def test_voxels_grow_with_the_reach(views: ViewStore) -> None:
     inner, outer = shells[0], shells[-1]
     assert inner.bounds.longest_side < 3.0
     assert outer.bounds.longest_side > 30.0
-    assert inner.voxel == pytest.approx(inner.bounds.longest_side / 64)
+    assert inner.voxel == pytest.approx(inner.bounds.usual_side / 64)
     assert outer.voxel == pytest.approx(inner.voxel * 8.0)
 
 
