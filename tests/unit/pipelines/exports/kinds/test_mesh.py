@@ -396,7 +396,8 @@ def test_holes_up_to_a_stated_size_are_closed_and_the_report_says_how_many(job: 
     assert len(border_loops(after.faces)) < len(border_loops(before.faces))
     count = len(before.faces)
     assert len(after.faces) > count
-    np.testing.assert_array_equal(after.faces[:count], before.faces)
+    # Corners, not numbers: a vertex that only what closes a hole needs is counted, too.
+    np.testing.assert_array_equal(after.points[after.faces[:count]], before.points[before.faces])
 
 
 def test_a_subject_to_be_printed_is_watertight_and_others_are_told_not_to_be(
