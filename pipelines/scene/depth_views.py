@@ -97,6 +97,21 @@ class DepthView:
         world: Floats = local @ self.world_from_camera[:, :3].T + self.world_from_camera[:, 3]
         return world
 
+    def seen_at(self, points: NDArray[np.floating]) -> tuple[Floats, Floats]:
+        """Depths [P] of world points [P, 3], and what the view shows at their pixels [P]: depths,
+        0 where unknown, and NaN for points that are not in the picture.
+        """
+        local = (points - self.world_from_camera[:, 3]) @ self.world_from_camera[:, :3]
+        depth, lens = -local[:, 2], self.lens
+        before = depth > 0.0
+        safe = np.where(before, depth, 1.0)
+        column = np.floor(lens.fl_x * local[:, 0] / safe + lens.cx)
+        row = np.floor(-lens.fl_y * local[:, 1] / safe + lens.cy)
+        inside = before & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
+        shown = np.full(len(points), np.nan)
+        shown[inside] = self.z_depth[row[inside].astype(int), column[inside].astype(int)]
+        return depth, shown
+
     def camera_from_world_cv(self, origin: Floats) -> Floats:
         """[4, 4] from (world - origin) to the OpenCV camera (y down, z forward)."""
         rotation = self.world_from_camera[:, :3] @ np.diag([1.0, -1.0, -1.0])

@@ -306,18 +306,10 @@ def looks(view: DepthView, points: Floats, margins: Floats) -> tuple[Bools, Bool
     margins: [P], how far from a point what is there may be along the view's axis. Points that are
     not in the picture, or behind something, are neither.
     """
-    local = (points - view.world_from_camera[:, 3]) @ view.world_from_camera[:, :3]
-    depth, lens = -local[:, 2], view.lens
-    before = depth > 0.0
-    safe = np.where(before, depth, 1.0)
-    column = np.floor(lens.fl_x * local[:, 0] / safe + lens.cx)
-    row = np.floor(-lens.fl_y * local[:, 1] / safe + lens.cy)
-    inside = before & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
-    shown = np.full(len(points), np.nan)
-    shown[inside] = view.z_depth[row[inside].astype(int), column[inside].astype(int)]
+    depth, shown = view.seen_at(points)
     margin = np.maximum(margins, _DEPTH_SHARE * depth)
-    behind: Bools = inside & ((shown == 0.0) | (shown > depth + margin))
-    there: Bools = inside & (shown > 0.0) & (shown >= depth - margin) & (shown <= depth + margin)
+    behind: Bools = (shown == 0.0) | (shown > depth + margin)
+    there: Bools = (shown > 0.0) & (shown >= depth - margin) & (shown <= depth + margin)
     return behind, there
 
 

@@ -202,18 +202,10 @@ def _looks_at(
     """[P, 2], how many views show points [P, 3], and how many look through them."""
     there, through = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
-        lens = view.lens
-        local = (points - view.world_from_camera[:, 3]) @ view.world_from_camera[:, :3]
-        depth = np.where(local[:, 2] < 0.0, -local[:, 2], np.inf)
-        column = np.floor(lens.fl_x * local[:, 0] / depth + lens.cx)
-        row = np.floor(-lens.fl_y * local[:, 1] / depth + lens.cy)
-        inside = np.isfinite(depth) & (column >= 0) & (column < lens.width)
-        which = np.flatnonzero(inside & (row >= 0) & (row < lens.height))
-        shown = view.z_depth[row[which].astype(int), column[which].astype(int)]
-        beyond = shown - depth[which]
-        margin = np.maximum(_NOISE_VOXELS * voxel, _NOISE * depth[which])
-        through[which] += beyond > margin
-        there[which] += (shown > 0.0) & (np.abs(beyond) <= margin)
+        depth, shown = view.seen_at(points)
+        margin = np.maximum(_NOISE_VOXELS * voxel, _NOISE * depth)
+        through += shown > depth + margin
+        there += (shown > 0.0) & (np.abs(shown - depth) <= margin)
     return np.stack([there, through], axis=1)
 
 
