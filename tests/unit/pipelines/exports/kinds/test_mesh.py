@@ -394,10 +394,11 @@ def test_holes_up_to_a_stated_size_are_closed_and_the_report_says_how_many(job: 
     assert closed["holes"]["closed"] > 0
     assert set(closed["holes"]["left_open"]) <= {"outer", "seen_through", "occupied", "tangled"}
     assert len(border_loops(after.faces)) < len(border_loops(before.faces))
-    count = len(before.faces)
-    assert len(after.faces) > count
-    # Corners, not numbers: a vertex that only what closes a hole needs is counted, too.
-    np.testing.assert_array_equal(after.points[after.faces[:count]], before.points[before.faces])
+    assert len(after.faces) > len(before.faces)
+    # The rest stays. Outlines are moved afterwards, and those that a hole was beside otherwise.
+    moved = cKDTree(after.points).query(before.points)[0]
+    assert np.quantile(moved, 0.9) < 0.01 * closed["voxel"]
+    assert np.quantile(moved, 0.99) < closed["voxel"]
 
 
 def test_a_subject_to_be_printed_is_watertight_and_others_are_told_not_to_be(
