@@ -54,6 +54,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     from pipelines.exports.formats.glb import read_mesh
     from pipelines.exports.judged import mesh_of
     from pipelines.exports.paths.flight import held_upright, make_path, typical_lens
+    from pipelines.exports.paths.walls import Walls
     from pipelines.exports.shots import Lens, MeshStudio
 
     path = mesh_of(ctx.workspace.stage("mesh"))
@@ -67,7 +68,8 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     studio = MeshStudio(read_mesh(path))
     lenses = [scene.lens_of(image) for image in scene.cameras.images]
     images, own = held_upright(scene.cameras.images, typical_lens(lenses))
-    flight = make_path(options, images, options.frames())
+    walls = Walls.of(path.parent)
+    flight = make_path(options, images, options.frames(), walls)
     lens = Lens(options, own, flight)
     film = Film(
         options,
@@ -82,7 +84,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
 
 EXPORT = Export(
     kind="meshvideo",
-    version=3,
+    version=4,
     reads=("mesh",),
     run=run,
     options=MeshVideoOptions,

@@ -99,7 +99,10 @@ def run(scene: TrainedScene, options: ViewsOptions, ctx: StageContext) -> dict[s
     from pipelines.exports.formats.archive import entry
     from pipelines.exports.formats.depth_pictures import unit_of
 
-    cameras = (_path_cameras if options.cameras == "path" else _training_cameras)(scene, options)
+    if options.cameras == "path":
+        cameras = _path_cameras(scene, options, ctx.workspace.stage("mesh"))
+    else:
+        cameras = _training_cameras(scene, options)
     unit = options.depth_unit
     if unit is None and scene.cameras.metric:
         unit = _MILLIMETRE
@@ -157,9 +160,10 @@ def _training_cameras(scene: TrainedScene, options: ViewsOptions) -> list[_Camer
     ]
 
 
-def _path_cameras(scene: TrainedScene, options: ViewsOptions) -> list[_Camera]:
-    """Those of the path's frames. Raises ExportError as the path does."""
+def _path_cameras(scene: TrainedScene, options: ViewsOptions, mesh: Path) -> list[_Camera]:
+    """Those of the path's frames. mesh: its folder. Raises ExportError as the path does."""
     from pipelines.exports.paths.flight import lens_of_size, make_path, typical_lens
+    from pipelines.exports.paths.walls import Walls
     from pipelines.scene.depth_views import Pinhole
 
     images = scene.cameras.images
@@ -168,7 +172,7 @@ def _path_cameras(scene: TrainedScene, options: ViewsOptions) -> list[_Camera]:
     if options.path == "camera_path" and options.camera_path is not None:
         file = options.camera_path
         lens, count = lens_of_size(own, file.render_width, file.render_height), file.frames()
-    flight = make_path(options, images, count)
+    flight = make_path(options, images, count, Walls.of(mesh))
     return [(flight.lens(index, lens), pose, None) for index, pose in enumerate(flight.poses)]
 
 
@@ -239,7 +243,8 @@ def _transforms(frames: list[dict[str, Any]], unit: float, scene: TrainedScene) 
 
 EXPORT = Export(
     kind="views",
-    version=2,
+    version=3,
+    reads=("mesh",),
     run=run,
     options=ViewsOptions,
     on_request=True,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.exports.paths.catalogue import PATHS
 from pipelines.exports.paths.options import PathOptions
+from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.capture_order import nearest_pose_distance
 from pipelines.scene.depth_views import Pinhole
@@ -46,11 +47,19 @@ class Flight:
         return replace(lens, fl_x=focal, fl_y=focal, cx=lens.width / 2.0, cy=lens.height / 2.0)
 
 
-def make_path(options: PathOptions, images: Sequence[PosedImage], num_frames: int) -> Flight:
-    """The path that options name, in so many frames; a file's own number counts for more."""
+def make_path(
+    options: PathOptions,
+    images: Sequence[PosedImage],
+    num_frames: int,
+    walls: Walls | None = None,
+) -> Flight:
+    """The path that options name, in so many frames; a file's own number counts for more.
+
+    walls: of the job's mesh, where it has one: what a path makes up for itself stays within them.
+    """
     module_name, _, function_name = PATHS[options.path].partition(":")
     path: Callable[..., Flight] = getattr(importlib.import_module(module_name), function_name)
-    return path(images, options, num_frames)
+    return path(images, options, num_frames, walls)
 
 
 def held_upright(

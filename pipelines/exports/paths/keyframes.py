@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pipelines.exports.paths.flight import Flight, looking_at
 from pipelines.exports.paths.options import Keyframe, PathOptions
 from pipelines.exports.paths.spline import through
+from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.capture_order import capture_order
 from pipelines.scene.rotations import rotation_matrices
@@ -18,10 +19,10 @@ Floats = NDArray[np.float64]
 
 
 def through_keyframes(
-    images: Sequence[PosedImage], options: PathOptions, num_frames: int
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
 ) -> Flight:
     """A flight through `video.keyframes`."""
-    del images
+    del images, walls
     frames = options.keyframes
     told = [one.fov_deg for one in frames if one.fov_deg is not None]
     ways = len(frames) - (0 if options.loop else 1)
@@ -44,8 +45,11 @@ def _pose(frame: Keyframe) -> Floats:
     return pose
 
 
-def through_captured(images: Sequence[PosedImage], options: PathOptions, num_frames: int) -> Flight:
+def through_captured(
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+) -> Flight:
     """A flight that passes every captured pose, in the order of the walk, as long at each."""
+    del walls
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     if len(poses) < 2:
         return Flight(np.repeat(poses, num_frames, axis=0))

@@ -13,15 +13,18 @@ from numpy.typing import NDArray
 from pipelines.exports.paths.flight import Flight
 from pipelines.exports.paths.options import PathOptions
 from pipelines.exports.paths.spline import through
+from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.rotations import quaternions, rotation_matrices
 
 Floats = NDArray[np.float64]
 
 
-def as_in_file(images: Sequence[PosedImage], options: PathOptions, num_frames: int) -> Flight:
+def as_in_file(
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+) -> Flight:
     """The frames of the file, or so many along its keyframes where it has no other."""
-    del images
+    del images, walls
     file = options.camera_path
     assert file is not None, "options were checked"
     if file.camera_path:

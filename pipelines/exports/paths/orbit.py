@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipelines.errors import ExportError
 from pipelines.exports.paths.flight import Flight, looking_at
 from pipelines.exports.paths.options import PathOptions
+from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.focus import find_focus
 
@@ -23,11 +24,14 @@ _STEEPEST = np.sin(np.radians(80.0))
 """Cameras that look down more steeply have no level circle: the sideways axis would spin."""
 
 
-def orbit(images: Sequence[PosedImage], options: PathOptions, num_frames: int) -> Flight:
+def orbit(
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+) -> Flight:
     """Poses that look at the focus, or so far above it; the last is one step before the first.
 
     Raises ExportError (no_focus) where the cameras look at no common point.
     """
+    del walls
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     focus = find_focus(poses)
     if focus is None:

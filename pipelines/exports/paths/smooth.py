@@ -6,7 +6,9 @@ moving. Rotations are unit quaternions (w, x, y, z).
 
 Where the cameras look at a point, the focus, two things are fitted by themselves beside position
 and rotation: the distance to it, and the direction in which each camera sees it. Averages of
-positions cut corners, and averages of rotations know nothing of what is looked at.
+positions cut corners, and averages of rotations know nothing of what is looked at. Around a thing
+that keeps a gap in the capture from leading through it; between the corners of a room it would lead
+out through a wall, so a wall of the mesh ends what is pushed towards it.
 
 This file knows only poses; lenses and rendering are left to who asks for the path.
 """
@@ -17,9 +19,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from pipelines.exports.paths.flight import Flight
 from pipelines.exports.paths.options import PathOptions
+from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.capture_order import capture_order, turn_length
 from pipelines.scene.focus import find_focus
@@ -29,21 +33,28 @@ Floats = NDArray[np.float64]
 
 _SMOOTHING_SHARE = 1.0 / 30.0
 _OVERSAMPLING = 8
+_CLEARANCE = 0.05
+"""Of the distance to the focus: so far a wall stays away from what is pushed towards it, and a push
+of less is none to ask about."""
 _MIN_AGREEMENT = 1e-3
 """A mean direction shorter than this is none: cameras that see the focus on opposite sides."""
 
 
-def smooth_flight(images: Sequence[PosedImage], options: PathOptions, num_frames: int) -> Flight:
-    """World poses along the captured ones, in the order of the walk."""
+def smooth_flight(
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+) -> Flight:
+    """World poses along the captured ones, in the order of the walk, on this side of the walls."""
     del options
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     order = capture_order(
         poses, [image.file for image in images], [image.timestamp_s for image in images]
     )
-    return Flight(smooth_path(poses[order], num_frames, find_focus(poses)))
+    return Flight(smooth_path(poses[order], num_frames, find_focus(poses), walls))
 
 
-def smooth_path(poses: Floats, num_frames: int, focus: Floats | None = None) -> Floats:
+def smooth_path(
+    poses: Floats, num_frames: int, focus: Floats | None = None, walls: Walls | None = None
+) -> Floats:
     """`num_frames` poses along a smooth path through `poses`, at nearly constant speed.
 
     poses: [N, 3, 4] in walking order, N >= 1. Positions are a local linear fit along the arc
@@ -53,6 +64,8 @@ def smooth_path(poses: Floats, num_frames: int, focus: Floats | None = None) -> 
     the window's own, so that a gap in the capture is passed around the subject and not through it;
     and so is its direction in the camera: where all of the window's poses have the focus in their
     pictures, so has the path.
+    walls: what a place that the distance pushes away from its neighbours must not lie behind; there
+    the distance is kept as far as there is room.
     Returns [num_frames, 3, 4] with exact rotations. Raises ValueError without poses or frames.
     """
     if len(poses) == 0 or num_frames < 1:
@@ -61,13 +74,16 @@ def smooth_path(poses: Floats, num_frames: int, focus: Floats | None = None) -> 
     s = _arc_length(poses, turn)
     if s[-1] <= 1e-9:
         return np.repeat(poses[:1], num_frames, axis=0)
-    dense = _windowed(poses, s, np.linspace(0.0, s[-1], _OVERSAMPLING * num_frames), focus)
+    s_at = np.linspace(0.0, s[-1], _OVERSAMPLING * num_frames)
+    dense = _windowed(poses, s, s_at, focus)
+    pushed = np.ones(len(s_at))
+    if focus is not None and walls is not None:
+        pushed = _room(poses, s, s_at, focus, walls)
+        dense = _windowed(poses, s, s_at, focus, pushed)
     s_dense = _arc_length(dense, turn)
     # Evenly spaced along the smoothed way: constant speed.
-    at = np.interp(
-        np.linspace(0.0, s_dense[-1], num_frames), s_dense, np.linspace(0.0, s[-1], len(dense))
-    )
-    return _windowed(poses, s, at, focus)
+    at = np.interp(np.linspace(0.0, s_dense[-1], num_frames), s_dense, s_at)
+    return _windowed(poses, s, at, focus, np.interp(at, s_at, pushed))
 
 
 def _arc_length(poses: Floats, turn: float) -> Floats:
@@ -79,8 +95,39 @@ def _arc_length(poses: Floats, turn: float) -> Floats:
     return length
 
 
-def _windowed(poses: Floats, s: Floats, at: Floats, focus: Floats | None) -> Floats:
-    """Poses [M, 3, 4] at arc lengths `at` [M], from `poses` at `s` [N]."""
+def _room(poses: Floats, s: Floats, at: Floats, focus: Floats, walls: Walls) -> Floats:
+    """[M] how much of its push to the focus's distance a place at `at` can have, 0 to 1.
+
+    All, where the captured poses on both sides of it see it, or where the way to it, from between
+    them, meets no wall. It changes as slowly along the path as the path does.
+    """
+    start = _windowed(poses, s, at, focus, np.zeros(len(at)))[:, :, 3]
+    end = _windowed(poses, s, at, focus)[:, :, 3]
+    length = np.linalg.norm(end - start, axis=1)
+    clearance = _CLEARANCE * np.linalg.norm(end - focus, axis=1)
+    asked = np.flatnonzero(length > clearance)
+    way = (end - start)[asked] / length[asked, None]
+    beyond = end[asked] + clearance[asked, None] * way
+    after = np.clip(np.searchsorted(s, at[asked]), 1, len(s) - 1)
+    hidden = walls.hide(poses[after - 1, :, 3], beyond) | walls.hide(poses[after, :, 3], beyond)
+    asked, way = asked[hidden], way[hidden]
+    share = np.ones(len(at))
+    free = walls.distance(start[asked], way) - clearance[asked]
+    share[asked] = np.clip(free / length[asked], 0.0, 1.0)
+    window = 1 + 2 * round(_SMOOTHING_SHARE * len(at) / 2.0)
+    lowest = minimum_filter1d(share, window, mode="nearest")
+    room: Floats = uniform_filter1d(lowest, window, mode="nearest")
+    return room
+
+
+def _windowed(
+    poses: Floats, s: Floats, at: Floats, focus: Floats | None, pushed: Floats | None = None
+) -> Floats:
+    """Poses [M, 3, 4] at arc lengths `at` [M], from `poses` at `s` [N].
+
+    pushed: [M] how far each goes from the mean of places, 0, to the mean distance from the focus,
+    1; None for all the way.
+    """
     offset = s[None, :] - at[:, None]
     # The window reaches the third nearest pose, so that a gap never leaves it empty.
     third = np.partition(np.abs(offset), min(2, len(s) - 1), axis=1)[:, min(2, len(s) - 1)]
@@ -96,7 +143,10 @@ def _windowed(poses: Floats, s: Floats, at: Floats, focus: Floats | None) -> Flo
         wanted = _local_line(weight, offset, np.linalg.norm(centers - focus, axis=1)[:, None])
         away = position - focus
         length = np.linalg.norm(away, axis=1, keepdims=True)
-        position = focus + away * np.where(length > 1e-9, wanted / np.maximum(length, 1e-9), 1.0)
+        factor = np.where(length > 1e-9, wanted / np.maximum(length, 1e-9), 1.0)
+        if pushed is not None:
+            factor = 1.0 + pushed[:, None] * (factor - 1.0)
+        position = focus + away * factor
         rotation = _aimed(rotation, position, weight @ _directions_to(focus, poses), focus)
     path: Floats = np.concatenate((rotation, position[:, :, None]), axis=2)
     return path

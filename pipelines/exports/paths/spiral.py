@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipelines.exports.paths.flight import Flight, looking_at
 from pipelines.exports.paths.options import PathOptions
+from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.focus import find_focus
 
@@ -24,8 +25,11 @@ _DEPTHS = 0.5
 """Of the radius, how far the camera goes nearer and farther."""
 
 
-def spiral(images: Sequence[PosedImage], options: PathOptions, num_frames: int) -> Flight:
+def spiral(
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+) -> Flight:
     """[num_frames] poses; the last is one step before the first."""
+    del walls
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     away = np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=1)
     turned = np.linalg.norm(poses[:, :, 2] - poses[:, :, 2].mean(axis=0), axis=1)

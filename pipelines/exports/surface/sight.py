@@ -28,7 +28,7 @@ class Sight:
         self.reached(np.zeros(3), np.ones((1, 3)))
 
     def reached(self, eye: Floats, targets: Floats) -> NDArray[np.bool_]:
-        """Whether nothing lies between an eye [3] and targets [N, 3]."""
+        """Whether nothing lies between an eye [3], or one each [N, 3], and targets [N, 3]."""
         if len(targets) == 0:
             return np.zeros(0, np.bool_)
         rays = np.concatenate([np.broadcast_to(eye, targets.shape), targets - eye], axis=1)
@@ -39,7 +39,7 @@ class Sight:
     def met(
         self, eye: Floats, ways: Floats
     ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
-        """What rays from an eye [3] along directions [N, 3] meet first.
+        """What rays from an eye [3], or one each [N, 3], along directions [N, 3] meet first.
 
         Returns distances [N] in lengths of the directions, infinite where there is nothing, faces
         [N], there 0, and where in the face as barycentric coordinates [N, 3].

@@ -12,6 +12,9 @@ from PIL import Image
 
 from pipelines.errors import Cancelled, ToolError
 from pipelines.exports.formats import mp4
+from pipelines.exports.paths import flight
+from pipelines.exports.paths.flight import Flight
+from pipelines.exports.paths.walls import Walls
 from pipelines.manifest import RunHooks
 from pipelines.options import OptionsError, resolve_options
 from pipelines.scene.cameras_file import CamerasFile
@@ -30,6 +33,36 @@ def test_the_video_plays_in_a_browser(job: Workspace) -> None:
     with Image.open(job.stage("video") / "preview.jpg") as picture:
         assert picture.size == (36, 64)
         assert np.asarray(picture).std() > 5.0
+
+
+def test_films_heed_the_jobs_mesh_where_it_has_one(
+    job: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heeded: list[Walls | None] = []
+
+    def record(*args: Any) -> Flight:
+        heeded.append(args[-1])
+        return made(*args)
+
+    made = flight.make_path
+    monkeypatch.setattr(flight, "make_path", record)
+    wanted: dict[str, dict[str, Any]] = {
+        "video": {"num_frames": 8},
+        "views": {"cameras": "path", "num_frames": 2, "formats": ("png",)},
+    }
+    tiny_job.run(job, "video", **wanted["video"])
+    assert heeded == [None]
+    tiny_job.run(job, "mesh", texture="none")
+    for kind, options in {**wanted, "meshvideo": {"num_frames": 8}}.items():
+        tiny_job.run(job, kind, **options)
+    assert len(heeded) == 4
+    eye = np.asarray(
+        CamerasFile.load(job.stage("train") / "cameras.json").images[0].world_from_camera
+    )
+    for walls in heeded[1:]:
+        assert walls is not None
+        # What was filmed is in the way of whoever looks through it.
+        assert walls.hide(eye[None, :, 3], eye[None, :, 3] - 20.0 * eye[None, :, 2]).all()
 
 
 def test_a_cancel_in_the_middle_leaves_nothing(job: Workspace) -> None:

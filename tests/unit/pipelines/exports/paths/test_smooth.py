@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
 from pipelines.exports.paths.smooth import Floats, smooth_path
+from pipelines.exports.paths.walls import Walls
+from pipelines.exports.surface.surface_file import KeptSurface
 from pipelines.scene.capture_order import capture_order, nearest_pose_distance
 from pipelines.scene.focus import find_focus
 from tests.unit.pipelines.scene.synthetic_views import arc, look_at
@@ -128,3 +131,75 @@ def test_the_subject_may_leave_the_picture_where_the_photos_left_it() -> None:
     assert aside[40:50].min() > 60.0
     assert aside[:15].max() < 5.0
     assert aside[-15:].max() < 5.0
+
+
+def walls_of(mesh: trimesh.Trimesh, voxel: float = 0.02) -> Walls:
+    """As a job's mesh has them, in single precision about an origin of its own."""
+    origin = mesh.vertices.mean(axis=0)
+    vertices = (mesh.vertices - origin).astype(np.float32)
+    sizes = np.full(len(vertices), voxel, np.float32)
+    return Walls(KeptSurface(origin, vertices, mesh.faces.astype(np.int32), sizes))
+
+
+def of_a_room(size: tuple[float, float, float]) -> Walls:
+    """Its walls, floor and ceiling, whose outside is the room, and a table in its middle."""
+    room = trimesh.creation.box(size)
+    room.apply_translation([0.0, 0.0, size[2] / 2.0])
+    room.invert()
+    table = trimesh.creation.box([0.9, 0.6, 0.7])
+    table.apply_translation([0.0, 0.0, 0.35])
+    return walls_of(room + table)
+
+
+def photos_from(corners: list[tuple[float, float]], looks_deg: list[float]) -> Floats:
+    """Photos taken at about 1.5 m from corners of a room, of what lies about its middle."""
+    rng = np.random.default_rng(0)
+    poses = []
+    for x, y in corners:
+        for aside in np.radians(looks_deg):
+            angle = np.arctan2(-y, -x) + aside
+            place = np.array([x, y, 1.5]) + rng.uniform(-0.1, 0.1, 3)
+            poses.append(look_at(place, place + np.array([np.cos(angle), np.sin(angle), -0.25])))
+    photos = np.stack(poses)
+    names = [f"{i:03d}.jpg" for i in range(len(photos))]
+    return photos[capture_order(photos, names, [None] * len(photos))]
+
+
+def outside(path: Floats, size: tuple[float, float, float]) -> np.ndarray:
+    """[N] how far a place is outside a room that stands on z = 0; below 0 it is within."""
+    away = np.abs(path[:, :, 3] - [0.0, 0.0, size[2] / 2.0]) - np.asarray(size) / 2.0
+    return np.asarray(away.max(axis=1))
+
+
+@pytest.mark.parametrize("size", [(4.0, 3.0, 2.5), (5.0, 4.0, 2.5), (6.0, 3.5, 2.6)])
+@pytest.mark.parametrize("looks", [[-20.0, 0.0, 20.0], [-28.0, -14.0, 0.0, 14.0, 28.0]])
+def test_a_film_of_photos_from_a_rooms_corners_stays_within_its_walls(
+    size: tuple[float, float, float], looks: list[float]
+) -> None:
+    x, y = size[0] / 2.0 - 0.3, size[1] / 2.0 - 0.3
+    photos = photos_from([(x, y), (-x, y), (-x, -y), (x, -y)], looks)
+    focus = find_focus(photos)
+    assert focus is not None
+    assert (outside(smooth_path(photos, 240, focus), size) > 0.0).mean() > 0.2
+    path = smooth_path(photos, 240, focus, of_a_room(size))
+    assert outside(path, size).max() < -0.05
+    steps = np.linalg.norm(np.diff(path[:, :, 3], axis=0), axis=1)
+    assert steps.max() < 3.0 * np.median(steps)
+    assert aside_deg(path, focus).max() <= aside_deg(photos, focus).max() + 1e-6
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+def test_walls_leave_a_film_around_a_thing_as_it_was(is_open: bool) -> None:
+    """A gap of a third of the ring, the thing a ball that reaches halfway to the cameras, closed or
+    without its back, in the middle of a room."""
+    angles = np.radians(np.linspace(0.0, 240.0, 40))
+    places = 3.0 * np.stack([np.cos(angles), np.sin(angles), np.full(40, 0.3)], axis=-1)
+    photos = np.stack([look_at(place, np.zeros(3)) for place in places])
+    ball = trimesh.creation.icosphere(3, 0.5 * float(np.linalg.norm(photos[0, :, 3])))
+    if is_open:
+        ball.update_faces(ball.triangles_center @ photos[:, :, 3].mean(axis=0) > 0.0)
+    room = trimesh.creation.box([20.0, 20.0, 20.0])
+    room.invert()
+    walls = walls_of(ball + room)
+    path = smooth_path(photos, 96, np.zeros(3))
+    np.testing.assert_array_equal(smooth_path(photos, 96, np.zeros(3), walls), path)
