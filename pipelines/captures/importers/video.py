@@ -72,6 +72,8 @@ def scan(path: Path, ctx: StageContext) -> Scan:
         on_stdout=on_stdout,
     )
     seconds = unit[0] if unit else 0.0
+    # What an edit list hides lies before 0: the rest needs it to be decoded, and nobody sees it.
+    times = [time for time in times if time >= 0] or times
     return Scan(
         times_s=tuple(sorted(value * seconds for value in times)),
         duration_s=max(ends, default=0) * seconds,

@@ -31,7 +31,14 @@ from pipelines.scene.rotations import quaternions, rotation_between, rotation_ma
 
 Floats = NDArray[np.float64]
 
-_SMOOTHING_SHARE = 1.0 / 30.0
+_SMOOTHING_SHARE, _SMOOTHING_TURN_RAD = 1.0 / 30.0, 0.42
+"""What is smoothed over: a thirtieth of the way; of a film that looks about no more than that is of
+a way that goes round once, in radians of the metric: of a walk through five rooms a thirtieth leads
+through walls. Photos, in whatever order they are, would have the camera jump from one to the next.
+"""
+_STEEP, _LEVEL = 0.2, 0.6
+"""Of the world's up, what lies in a picture's plane: up to this it has no upper side, and from this
+on it has. Between them a horizon counts by and by."""
 _OVERSAMPLING = 8
 _CLEARANCE = 0.05
 """Of the distance to the focus: so far a wall stays away from what is pushed towards it, and a push
@@ -49,41 +56,53 @@ def smooth_flight(
     order = capture_order(
         poses, [image.file for image in images], [image.timestamp_s for image in images]
     )
-    return Flight(smooth_path(poses[order], num_frames, find_focus(poses), walls))
+    focus = find_focus(poses)
+    is_walk = focus is None and all(image.timestamp_s is not None for image in images)
+    return Flight(smooth_path(poses[order], num_frames, focus, walls, is_walk=is_walk))
 
 
 def smooth_path(
-    poses: Floats, num_frames: int, focus: Floats | None = None, walls: Walls | None = None
+    poses: Floats,
+    num_frames: int,
+    focus: Floats | None = None,
+    walls: Walls | None = None,
+    *,
+    is_walk: bool = False,
 ) -> Floats:
     """`num_frames` poses along a smooth path through `poses`, at nearly constant speed.
 
     poses: [N, 3, 4] in walking order, N >= 1. Positions are a local linear fit along the arc
-    length with a Gaussian window of a thirtieth of the path (wider where poses are sparse), which
-    removes the shake of the hand and keeps the way; rotations are the window's mean quaternion.
+    length with a Gaussian window of a thirtieth of the path (less of a walk, wider where poses are
+    sparse), which removes the shake of the hand and keeps the way; rotations are the window's
+    mean quaternion, with +Z as far up in the picture as the window's poses have it.
     focus: [3], what the cameras look at, where there is such a point. The distance to it is then
     the window's own, so that a gap in the capture is passed around the subject and not through it;
     and so is its direction in the camera: where all of the window's poses have the focus in their
     pictures, so has the path.
     walls: what a place that the distance pushes away from its neighbours must not lie behind; there
     the distance is kept as far as there is room.
+    is_walk: whether poses follow each other in a film that looks about, so that the way is theirs.
     Returns [num_frames, 3, 4] with exact rotations. Raises ValueError without poses or frames.
     """
     if len(poses) == 0 or num_frames < 1:
         raise ValueError(f"a path needs poses and frames, got {len(poses)} and {num_frames}")
     turn = turn_length(poses)
     s = _arc_length(poses, turn)
+    width = s[-1] * _SMOOTHING_SHARE
+    if is_walk:
+        width = min(width, turn * _SMOOTHING_TURN_RAD)
     if s[-1] <= 1e-9:
         return np.repeat(poses[:1], num_frames, axis=0)
     s_at = np.linspace(0.0, s[-1], _OVERSAMPLING * num_frames)
-    dense = _windowed(poses, s, s_at, focus)
+    dense = _windowed(poses, s, s_at, width, focus)
     pushed = np.ones(len(s_at))
     if focus is not None and walls is not None:
-        pushed = _room(poses, s, s_at, focus, walls)
-        dense = _windowed(poses, s, s_at, focus, pushed)
+        pushed = _room(poses, s, s_at, width, focus, walls)
+        dense = _windowed(poses, s, s_at, width, focus, pushed)
     s_dense = _arc_length(dense, turn)
     # Evenly spaced along the smoothed way: constant speed.
     at = np.interp(np.linspace(0.0, s_dense[-1], num_frames), s_dense, s_at)
-    return _windowed(poses, s, at, focus, np.interp(at, s_at, pushed))
+    return _windowed(poses, s, at, width, focus, np.interp(at, s_at, pushed))
 
 
 def _arc_length(poses: Floats, turn: float) -> Floats:
@@ -95,14 +114,16 @@ def _arc_length(poses: Floats, turn: float) -> Floats:
     return length
 
 
-def _room(poses: Floats, s: Floats, at: Floats, focus: Floats, walls: Walls) -> Floats:
+def _room(
+    poses: Floats, s: Floats, at: Floats, width: float, focus: Floats, walls: Walls
+) -> Floats:
     """[M] how much of its push to the focus's distance a place at `at` can have, 0 to 1.
 
     All, where the captured poses on both sides of it see it, or where the way to it, from between
     them, meets no wall. It changes as slowly along the path as the path does.
     """
-    start = _windowed(poses, s, at, focus, np.zeros(len(at)))[:, :, 3]
-    end = _windowed(poses, s, at, focus)[:, :, 3]
+    start = _windowed(poses, s, at, width, focus, np.zeros(len(at)))[:, :, 3]
+    end = _windowed(poses, s, at, width, focus)[:, :, 3]
     length = np.linalg.norm(end - start, axis=1)
     clearance = _CLEARANCE * np.linalg.norm(end - focus, axis=1)
     asked = np.flatnonzero(length > clearance)
@@ -121,17 +142,23 @@ def _room(poses: Floats, s: Floats, at: Floats, focus: Floats, walls: Walls) -> 
 
 
 def _windowed(
-    poses: Floats, s: Floats, at: Floats, focus: Floats | None, pushed: Floats | None = None
+    poses: Floats,
+    s: Floats,
+    at: Floats,
+    usual: float,
+    focus: Floats | None,
+    pushed: Floats | None = None,
 ) -> Floats:
     """Poses [M, 3, 4] at arc lengths `at` [M], from `poses` at `s` [N].
 
+    usual: the window's width, where poses are no sparser.
     pushed: [M] how far each goes from the mean of places, 0, to the mean distance from the focus,
     1; None for all the way.
     """
     offset = s[None, :] - at[:, None]
     # The window reaches the third nearest pose, so that a gap never leaves it empty.
     third = np.partition(np.abs(offset), min(2, len(s) - 1), axis=1)[:, min(2, len(s) - 1)]
-    width = np.maximum(s[-1] * _SMOOTHING_SHARE, third)[:, None]
+    width = np.maximum(usual, third)[:, None]
     weight = np.exp(-0.5 * (offset / width) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
     centers = poses[:, :, 3]
@@ -148,6 +175,7 @@ def _windowed(
             factor = 1.0 + pushed[:, None] * (factor - 1.0)
         position = focus + away * factor
         rotation = _aimed(rotation, position, weight @ _directions_to(focus, poses), focus)
+    rotation = _levelled(rotation, weight @ poses[:, 2, :2])
     path: Floats = np.concatenate((rotation, position[:, :, None]), axis=2)
     return path
 
@@ -174,6 +202,25 @@ def _aimed(rotation: Floats, position: Floats, wanted: Floats, focus: Floats) ->
     unit = wanted[known] / length[known, None]
     aimed[known] = rotation[known] @ rotation_between(unit, seen[known])
     return aimed
+
+
+def _levelled(rotation: Floats, wanted: Floats) -> Floats:
+    """Rotations [M, 3, 3], rolled about their gaze until +Z lies in the picture where it lies in
+    the captured ones.
+
+    A mean of cameras that look from several sides is rolled, though none of them is. wanted:
+    [M, 2], the mean place of +Z in their picture planes. Where that is short, or a camera looks
+    nearly straight up or down, its rotation stays as it is.
+    """
+    found = rotation[:, 2, :2]
+    angle = np.arctan2(found[:, 1], found[:, 0]) - np.arctan2(wanted[:, 1], wanted[:, 0])
+    angle = np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
+    length = np.minimum(np.hypot(*wanted.T), np.hypot(*found.T))
+    angle *= np.clip((length - _STEEP) / (_LEVEL - _STEEP), 0.0, 1.0)
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    right, top, back = (rotation[:, :, axis] for axis in range(3))
+    rolled: Floats = np.stack([cosine * right + sine * top, cosine * top - sine * right, back], -1)
+    return rolled
 
 
 def _local_line(weight: Floats, offset: Floats, values: Floats) -> Floats:

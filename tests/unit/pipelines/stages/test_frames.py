@@ -84,6 +84,23 @@ def test_candidates_are_limited_and_even(tmp_path: Path) -> None:
     assert windows == list(range(10))
 
 
+def test_frames_that_a_trim_hides_are_not_counted(tmp_path: Path) -> None:
+    """Cut without decoding, the file begins at a key frame, and its edit list later."""
+    whole = tmp_path / "whole.mp4"
+    ffmpeg(
+        "-f", "lavfi", "-i", "testsrc2=s=320x180:r=30:d=8", "-g", "240",
+        "-pix_fmt", "yuv420p", whole,
+    )  # fmt: skip
+    clip = tmp_path / "a.mp4"
+    ffmpeg("-ss", "5.5", "-t", "2", "-i", whole, "-c", "copy", clip)
+    summary = ingested(tmp_path, clip)
+    assert summary["start_s"] == pytest.approx(0.0, abs=0.05)
+    summary, rows, _ = chosen(tmp_path, num_frames=20, max_step=0)
+    assert summary["warnings"] == []
+    times = np.asarray([row["timestamp_s"] for row in rows])
+    np.testing.assert_allclose(times, 0.1 * np.arange(20) + 0.05, atol=0.06)
+
+
 def test_variable_frame_rate_is_chosen_by_time(tmp_path: Path) -> None:
     """The first second has 10 frames, the second one 50."""
     marked_pictures(tmp_path / "p", 60, blurred=set())

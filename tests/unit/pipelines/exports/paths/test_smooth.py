@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -203,3 +205,57 @@ def test_walls_leave_a_film_around_a_thing_as_it_was(is_open: bool) -> None:
     walls = walls_of(ball + room)
     path = smooth_path(photos, 96, np.zeros(3))
     np.testing.assert_array_equal(smooth_path(photos, 96, np.zeros(3), walls), path)
+
+
+def ring(num: int, distance: float = 1.2, height: float = 0.6, start: float = 0.0) -> Floats:
+    """Cameras on a level ring that look at what lies a little above the world's origin."""
+    angles = start + np.arange(num) * 2.0 * np.pi / num
+    places = np.stack([np.cos(angles), np.sin(angles), np.full(num, height / distance)], axis=-1)
+    return np.stack([look_at(distance * place, np.array([0.0, 0.0, 0.1])) for place in places])
+
+
+@pytest.mark.parametrize("aside_rad", [np.pi, np.pi - 1.0, 0.3])
+def test_one_photo_from_another_side_does_not_tilt_the_horizon(aside_rad: float) -> None:
+    around = ring(40)
+    whole = ring(1, 3.5, 1.5, start=np.pi + aside_rad)
+    poses = np.concatenate((around[:20], whole, around[20:]))
+    path = smooth_path(poses, 240, find_focus(poses))
+    tilt = np.degrees(np.arctan2(path[:, 2, 0], path[:, 2, 1]))
+    has_horizon = np.hypot(path[:, 2, 0], path[:, 2, 1]) > 0.6
+    assert has_horizon.mean() > 0.4, "a camera that passes overhead looks straight down there"
+    assert np.abs(tilt[has_horizon]).max() < 5.0
+
+
+def test_the_horizon_of_pictures_on_their_side_stays_where_it_was() -> None:
+    poses = ring(40)
+    poses[:, :, :2] = poses[:, :, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    path = smooth_path(poses, 96, find_focus(poses))
+    tilt = np.degrees(np.arctan2(path[:, 2, 0], path[:, 2, 1]))
+    np.testing.assert_allclose(tilt, np.degrees(np.arctan2(poses[0, 2, 0], poses[0, 2, 1])), atol=5)
+
+
+def test_a_film_through_rooms_goes_through_their_doors() -> None:
+    """Five rooms of 3.2 by 3.4 m along a corridor, doors of 0.8 m, a walk in, about and out."""
+    corners = [(-0.5, 0.0)]
+    doors = [1.6 + 3.3 * room for room in range(5)]
+    for door in doors:
+        about = [(-1.0, 1.4), (-1.0, 3.4), (1.0, 3.4), (1.0, 1.4), (0.0, 1.2), (0.0, 0.0)]
+        corners += [(door, 0.0), (door, 1.2), *((door + x, y) for x, y in about)]
+    way = np.asarray([*corners, (17.0, 0.0)])
+    turns = np.unwrap(np.arctan2(*np.diff(way, axis=0).T[::-1]))
+    poses = []
+    for number, (start, end) in enumerate(itertools.pairwise(way)):
+        steps = max(2, round(5.0 * float(np.linalg.norm(end - start))))
+        after = turns[min(number + 1, len(turns) - 1)]
+        poses += [(*(start + t * (end - start)), turns[number]) for t in np.arange(steps) / steps]
+        poses += [(*end, turns[number] + t * (after - turns[number])) for t in (0.25, 0.5, 0.75)]
+    eyes = [np.array([x, y, 1.5]) for x, y, _ in poses]
+    aims = [np.array([np.cos(turn), np.sin(turn), -0.1]) for _, _, turn in poses]
+    walked = np.stack([look_at(e, e + a) for e, a in zip(eyes, aims, strict=True)])
+    path = smooth_path(walked, 480, is_walk=True)
+    x, y = path[:, :2, 3].T
+    crossing = np.flatnonzero(np.diff(y > 0.6))
+    assert len(crossing) == 10
+    assert np.abs(x[crossing, None] - doors).min(axis=1).max() < 0.4
+    inside = y > 0.7
+    assert np.abs(x[inside, None] - doors).min(axis=1).max() < 1.6
