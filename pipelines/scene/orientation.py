@@ -10,7 +10,9 @@ where every camera looks down. That is nerfstudio's `vertical` (cameras/camera_u
 auto_orient_and_center_poses), here with weights that make a few rolled cameras harmless.
 
 Photos that have lost their EXIF lie on their side as the sensor stored them. Then their Y axes are
-level and the X axes are not, and one end of these is up: `sideways`.
+level and the X axes are not, and one end of these is up: `sideways`. A phone that is turned while
+it films, whose file says one thing of all frames, leaves some of the one kind and some of the
+other: `either_way`.
 
 X axes that are all parallel say nothing: pictures of a floor, taken straight down one beside the
 other, are those of a wall. There only what the devices measured tells, which is asked first.
@@ -39,6 +41,11 @@ _NOT_LEVEL = 0.12
 people's hands have some 0.05."""
 _CLEARLY_LEVEL = 0.5
 """Of that, what the Y axes of pictures on their side have at most."""
+_NEITHER_LEVEL, _LEAST_OF_EACH = 0.07, 0.2
+"""Mean height of the leveller one of each camera's two axes, by what all X axes say, from which up
+may be another; and the share of the cameras that must be held each way then."""
+_STARTS, _STARTS_TRIED = 1000, 10
+"""Directions of a half sphere, 4 degrees apart, and how many of the best are refined."""
 _ALL_ROUND_DEG = 200.0
 """Where X axes are parallel: so much of a circle no upright camera is tipped through."""
 _MANY_UPSIDE_DOWN = 0.25
@@ -73,8 +80,8 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """How the world was turned and centred. up_from: measured, vertical, sideways, camera_up or
-    none.
+    """How the world was turned and centred. up_from: measured, either_way, vertical, sideways,
+    camera_up or none.
 
     centered_on: focus (the point that the cameras look at) or centers (their mean).
     """
@@ -93,8 +100,8 @@ def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
 def find_up(
     world_from_camera: Array, measured: Sequence[Sequence[float] | None] = ()
 ) -> tuple[Array, str]:
-    """The direction away from gravity, [3] unit, and how it was found: measured, vertical,
-    sideways or camera_up.
+    """The direction away from gravity, [3] unit, and how it was found: measured, either_way,
+    vertical, sideways or camera_up.
 
     measured: N, that direction [3] in each camera's axes where its device told it; or none at all.
     Raises ValueError where there are no cameras.
@@ -103,6 +110,8 @@ def find_up(
         raise ValueError("no cameras to find the vertical from")
     if (told := _agreed(world_from_camera, measured)) is not None:
         return told, "measured"
+    if (mixed := _up_of_either_way(world_from_camera)) is not None:
+        return mixed, "either_way"
     if (beside := _up_of_pictures_on_their_side(world_from_camera)) is not None:
         return beside, "sideways"
     x_axes = world_from_camera[:, :, 0]
@@ -117,6 +126,46 @@ def find_up(
     if length < _MIN_SIGN:
         return np.array([0.0, 0.0, 1.0]), "camera_up"
     return level / length, "camera_up"
+
+
+def _up_of_either_way(world_from_camera: Array) -> Array | None:
+    """The direction, [3] unit, to which of each camera the X axis or the Y axis is level, of some
+    the one and of some the other; None where all X axes or all Y axes do as well.
+
+    Its end is that of the cameras that are held upright.
+    """
+    axes = world_from_camera[:, :, :2]
+
+    def off(up: Array) -> float:
+        return float(np.abs(up @ axes).min(axis=1).mean())
+
+    usual = _level_to(axes[:, :, 0])
+    if usual is None or off(usual) < _NEITHER_LEVEL:
+        return None
+    starts = _half_sphere(_STARTS)
+    order = np.argsort([off(start) for start in starts], kind="stable")
+    found: list[Array] = []
+    for up in starts[order[:_STARTS_TRIED]]:
+        for _ in range(5):
+            rows = np.arange(len(axes))
+            up = _most_orthogonal(axes[rows, :, np.abs(up @ axes).argmin(axis=1)], up)
+        found.append(up)
+    best = min(found, key=off)
+    is_upright = np.abs(best @ axes).argmin(axis=1) == 0
+    share = float(is_upright.mean())
+    if off(best) > _CLEARLY_LEVEL * off(usual) or min(share, 1.0 - share) < _LEAST_OF_EACH:
+        return None
+    end: float = _sign_of_up(best, world_from_camera[is_upright])
+    return best * end
+
+
+def _half_sphere(num: int) -> Array:
+    """[num, 3] unit directions, evenly over the half sphere of z > 0 (Fibonacci's spiral)."""
+    place = np.arange(num) + 0.5
+    height, turn = 1.0 - place / num, np.pi * (1.0 + np.sqrt(5.0)) * place
+    flat = np.sqrt(1.0 - height**2)
+    directions: Array = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    return directions
 
 
 def _up_of_pictures_on_their_side(world_from_camera: Array) -> Array | None:

@@ -131,6 +131,38 @@ def test_what_may_be_held_either_way_is_taken_for_upright() -> None:
     assert angle_deg(up, random_rotation(2) @ [0, 0, 1]) < 2.0
 
 
+@pytest.mark.parametrize("share", [0.3, 0.4, 0.5, 0.6, 0.7])
+@pytest.mark.parametrize(("arc_deg", "height"), [(330.0, 0.7), (200.0, 0.7), (330.0, 0.25)])
+@pytest.mark.parametrize("clockwise", [1.0, -1.0])
+def test_a_phone_that_is_turned_while_it_films_leaves_the_world_upright(
+    share: float, arc_deg: float, height: float, clockwise: float
+) -> None:
+    rng = np.random.default_rng(4)
+    truth = orbit(90, height, arc_deg)
+    shaken = [rotation_about(rng.normal(scale=0.03, size=3)) @ pose for pose in truth]
+    cameras = np.stack(shaken)
+    turned = rolled(cameras, 90.0 * clockwise, slice(0, round(share * 90)))
+    up, found_by = find_up(turned)
+    assert angle_deg(up, np.array([0.0, 0.0, 1.0])) < 2.0, found_by
+    every_second = rolled(cameras, 90.0 * clockwise, slice(0, None, 2))
+    up, found_by = find_up(every_second)
+    assert found_by == "either_way"
+    assert angle_deg(up, np.array([0.0, 0.0, 1.0])) < 2.0
+
+
+def test_shaky_hands_of_whoever_holds_it_upright_are_no_turning() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        arc_deg, height = rng.uniform(60.0, 360.0), rng.uniform(0.1, 3.0)
+        cameras = np.stack(
+            [
+                rotation_about(rng.normal(scale=0.08, size=3)) @ pose
+                for pose in orbit(40, height, arc_deg)
+            ]
+        )
+        assert find_up(cameras)[1] != "either_way"
+
+
 def rotation_about(vector: np.ndarray) -> np.ndarray:
     """By the vector's length, in radians, about it."""
     return Rotation.from_rotvec(vector).as_matrix()
