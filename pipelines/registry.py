@@ -101,7 +101,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="draft",
-        version=8,
+        version=9,
         after=("depth",),
         reads=("ingest", "frames", "poses", "depth"),
         run="pipelines.stages.draft:run",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipelines.exports.each_view import each_view
 from pipelines.exports.surface.sight import Sight
-from pipelines.exports.texture.photos import Photos, colors_at, sharpness, softened
+from pipelines.exports.texture.photos import Photos, colors_at, softened
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.int32]
@@ -136,7 +136,7 @@ def _look(
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     glance, share = photos.glance(index)
-    score = area * sharpness(glance)
+    score = area * photos.sharpness(index)
     return faces, score, colors_at(softened(glance), middle * share)
 
 
