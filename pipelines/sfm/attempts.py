@@ -31,7 +31,7 @@ from pipelines.sfm.key_frames import (
     missing_keys,
     placing_pairs,
 )
-from pipelines.sfm.mending import mended
+from pipelines.sfm.mending import Sides, mended
 from pipelines.sfm.pairs import Pairs, choose_matcher, pairs_through_others, planned_pairs
 from pipelines.sfm.progress import ProgressScale, Span
 from pipelines.sfm.report import Attempt, Outcome, check_features
@@ -114,6 +114,7 @@ class Ladder:
         self._progress = ProgressScale(ctx)
         self._attempts: list[Attempt] = []
         self._statistics = PairStatistics.nothing(len(source.files))
+        self._sides: Sides = ()
 
     @property
     def outcome(self) -> Outcome:
@@ -345,7 +346,9 @@ class Ladder:
             self._clips(keys),
             is_film=self._source.is_video,
             logger=self._ctx.logger,
+            sides=self._sides,
         )
+        self._sides = mapping.sides or self._sides
         models = mapping.models
         most = best_model(models)
         if keys and most is not None and len(most.indices) >= _ENOUGH_KEYS * len(keys):
@@ -374,6 +377,7 @@ class Ladder:
             time.monotonic() - began,
             mapping.torn,
             mapping.left_out,
+            is_one_side=bool(mapping.sides),
         )
         self._attempts.append(attempt)
         self._ctx.logger.info(

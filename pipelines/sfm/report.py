@@ -47,7 +47,8 @@ _ADVICE = {
 class Attempt:
     """One run of the mapper. matcher: which pairs. models: all it found, in COLMAP's order. torn:
     images of a film between which the best model's path is torn. left_out: pairs of images that
-    matched, and were not used as they would have torn it (`pipelines.sfm.tears`)."""
+    matched, and were not used as they lay one side over another (`pipelines.sfm.tears`, `folds`).
+    is_one_side: whether these alone joined what is now apart."""
 
     rung: Rung
     matcher: str
@@ -55,6 +56,7 @@ class Attempt:
     seconds: float
     torn: tuple[tuple[int, int], ...] = ()
     left_out: frozenset[tuple[int, int]] = frozenset()
+    is_one_side: bool = False
 
     @property
     def best(self) -> SparseModel | None:
@@ -303,8 +305,21 @@ def doubts_of(model: SparseModel) -> list[dict[str, Any]]:
 
 
 def path_warnings(outcome: Outcome, source: Source) -> list[dict[str, Any]]:
-    """What is to be told of a film whose path is torn all the same."""
-    torn = outcome.chosen.torn
+    """What is to be told of a film whose path is torn all the same, and of one of several sides."""
+    chosen = outcome.chosen
+    if chosen.is_one_side:
+        num = len(source.files)
+        return [
+            {
+                "code": "sides_alike",
+                "message": f"The subject looks the same from several sides, and no picture joins "
+                f"them: {chosen.num_registered} of {num} pictures are used, those of one side.",
+                "hint": "Go from one side to the other slowly, with sharp pictures that overlap, "
+                "and put something with a pattern beside the subject, like a newspaper under it.",
+                "details": {"pairs_left_out": len(chosen.left_out)},
+            }
+        ]
+    torn = chosen.torn
     if not torn:
         return []
     files = [[source.files[i], source.files[j]] for i, j in torn]
