@@ -12,6 +12,7 @@ _SIFT_BYTES_PER_PX = 85
 _QUICK_GROWTH = 1.4
 """The model is adjusted as a whole each time it has grown by this factor; COLMAP's default 1.1
 costs twice the time and ends at the same errors, since the last adjustment is of all."""
+_ANY_OVERLAP = 1_000_000
 _QUICK_TRIALS = 1000
 """Random samples of matches at most. COLMAP's 10,000 go to pairs that then fail all the same."""
 
@@ -65,7 +66,8 @@ class MapperSettings:
     """How incremental mapping goes about it.
 
     thorough: bundle adjustment as often as COLMAP does by default, instead of after each growth by
-    40 %. thresholds: lower ones are for captures that COLMAP's fail on.
+    40 %, and models that overlap others as far as they lead. thresholds: lower ones are for
+    captures that COLMAP's fail on.
     """
 
     refine_focal: bool = True
@@ -116,7 +118,10 @@ def mapping_options(settings: MapperSettings, num_threads: int, seed: int) -> An
     options.max_num_models = 10
     options.ba_refine_focal_length = settings.refine_focal
     options.ba_refine_principal_point = settings.refine_principal_point
-    if not settings.thorough:
+    if settings.thorough:
+        # A later model may lead over an earlier one, and on: COLMAP ends it at 20 images of that.
+        options.max_model_overlap = _ANY_OVERLAP
+    else:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = _QUICK_GROWTH
         options.ba_global_max_refinements = 2
         options.ba_local_max_refinements = 1
