@@ -14,8 +14,9 @@ level and the X axes are not, and one end of these is up: `sideways`. A phone th
 it films, whose file says one thing of all frames, leaves some of the one kind and some of the
 other: `either_way`.
 
-X axes that are all parallel say nothing: pictures of a floor, taken straight down one beside the
-other, are those of a wall. There only what the devices measured tells, which is asked first.
+X axes that are all parallel say little: pictures of a floor, taken straight down one beside the
+other, are those of a wall. There what the devices measured tells, which is asked first, and how far
+cameras are tipped the planes that they see (`pipelines.scene.pitch`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipelines.scene.focus import find_focus
+from pipelines.scene.pitch import level_with_planes
 
 Array = npt.NDArray[np.float64]
 
@@ -81,7 +83,7 @@ class Similarity:
 @dataclass(frozen=True)
 class Normalisation:
     """How the world was turned and centred. up_from: measured, either_way, vertical, sideways,
-    camera_up or none.
+    planes, camera_up or none.
 
     centered_on: focus (the point that the cameras look at) or centers (their mean).
     """
@@ -281,17 +283,24 @@ def normalise(
     *,
     orient: bool = True,
     measured: Sequence[Sequence[float] | None] = (),
+    points: Array | None = None,
 ) -> Normalisation:
     """The similarity that puts a reconstruction of unknown frame and scale into ours.
 
-    world_from_camera: [N, 3, 4], OpenGL axes. measured: as in `find_up`. Afterwards gravity points
-    along -Z (if `orient`), the origin is the focus, or else the mean of the camera centres, and the
+    world_from_camera: [N, 3, 4], OpenGL axes. measured: as in `find_up`. points: [P, 3], what they
+    see, asked where the cameras only tell what is level. Afterwards gravity points along -Z (if
+    `orient`), the origin is the focus, or else the mean of the camera centres, and the
     largest absolute coordinate of a camera centre is 1. Cameras in one single point keep their
     scale.
     """
     up, up_from = np.array([0.0, 0.0, 1.0]), "none"
     if orient:
         up, up_from = find_up(world_from_camera, measured)
+        if up_from == "camera_up" and points is not None:
+            side = np.linalg.svd(world_from_camera[:, :, 0], full_matrices=False)[2][0]
+            by_planes = level_with_planes(points, world_from_camera[:, :, 3], side, up)
+            if by_planes is not None:
+                up, up_from = by_planes, "planes"
     rotation = rotation_to_z(up)
     focus = find_focus(world_from_camera)
     centers = world_from_camera[:, :, 3]

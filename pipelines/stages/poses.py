@@ -161,7 +161,12 @@ def _found(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
     ctx.progress(0.99, "writing the poses", 1.0)
     found = found_images(model, source)
     poses = opengl_from_opencv(found.world_from_camera)
-    world = normalise(poses, orient=options.orientation == "auto", measured=found.up)
+    world = normalise(
+        poses,
+        orient=options.orientation == "auto",
+        measured=found.up,
+        points=model.points,
+    )
     notes = {"up_from": world.up_from, "centered_on": world.centered_on}
     write_cameras(ctx.out / "cameras.json", found, world, notes)
     write_sparse_points(ctx.out / SPARSE_POINTS, model, world)
