@@ -405,7 +405,7 @@ def _given(take: Take) -> list[Finding]:
 
 
 def _doubted(take: Take) -> list[Finding]:
-    """Poses that were found, and that what pictures show contradicts as a whole."""
+    """Poses that were found, and that what pictures show contradicts, or that lack a side."""
     return [_told(warning, "severe") for warning in take.doubts]
 
 

@@ -73,8 +73,8 @@ class Clip:
     most_shared: int | None = None
 
 
-DOUBTS = ("path_torn", "poses_contradicted")
-"""Codes of warnings that a whole model of poses is doubted by."""
+DOUBTS = ("path_torn", "poses_contradicted", "sides_alike")
+"""Codes of warnings that a whole model of poses is doubted by, or that it has one side only."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Take:
     between the directions that the same point is seen from. is_metric: whether a unit is a metre;
     None where nobody said. given: of poses that came along, how well they fit the pictures
     (`pipelines.sfm.given_report`), with `warnings`. doubts: warnings that poses which were found
-    are wrong as a whole (`DOUBTS`). error: what ended the job, `{stage, code, message, hint,
-    details}`. clips: of a film in several, by their numbers; none of one in one.
+    are wrong as a whole, or not the whole (`DOUBTS`). error: what ended the job, `{stage, code,
+    message, hint, details}`. clips: of a film in several, by their numbers; none of one in one.
     """
 
     kind: str = ""
