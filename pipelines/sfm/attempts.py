@@ -6,6 +6,7 @@ measured), then more thorough ones where too few images register. The attempt wi
 
 from __future__ import annotations
 
+import itertools
 import os
 import statistics
 import time
@@ -53,6 +54,7 @@ from pipelines.sfm.rungs import (
 from pipelines.sfm.source import Source, camera_groups
 from pipelines.sfm.turning import focal_of_turning, is_turning
 from pipelines.sfm.wide_lenses import probing_pairs, recognised
+from pipelines.sfm.zooms import lens_changes
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
 from pipelines.tools.colmap_placing import num_tidying_steps
@@ -153,6 +155,7 @@ class Ladder:
             if not self._attempts and is_turning(self._statistics):
                 break
             self._start_focals()
+            self._part_lenses(rung.matches)
             self._map(rung, matcher, keys, (matched, end))
         return self.outcome
 
@@ -313,6 +316,25 @@ class Ladder:
             watch = self._progress.watch((planned, end), len(further), "matching further pair")
             self._reconstructor.match(further, watch, thorough=wanted.thorough)
         self._checkpoint.save(step)
+
+    def _part_lenses(self, wanted: Matches) -> None:
+        """Give the frames of a film another camera from where their lens changes."""
+        step = f"{wanted.database} zooms"
+        if not self._source.is_video or self._source.has_panoramas or self._checkpoint.has(step):
+            return
+        clips = self._source.stretches
+        pairs = [pair for clip in clips for pair in itertools.pairwise(clip)]
+        changes = lens_changes(self._reconstructor.verified_of(pairs), clips)
+        for images, scale in changes:
+            self._reconstructor.give_own_camera(images, scale)
+            self._ctx.logger.info(
+                "%s and %d more: a lens %.2f times as long",
+                self._source.files[images[0]],
+                len(images) - 1,
+                scale,
+            )
+        if changes:
+            self._checkpoint.save(step)
 
     def _start_focals(self) -> None:
         """Give mapping a focal length to start from, where matches tell one and nothing else does.

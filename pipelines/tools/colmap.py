@@ -35,7 +35,13 @@ from pipelines.errors import ToolError
 from pipelines.tools.colmap_adjustment import Run
 from pipelines.tools.colmap_lenses import LensTrials
 from pipelines.tools.colmap_placing import num_tidying_steps, place_others
-from pipelines.tools.colmap_probing import MatchedPairs, forget_pairs, set_lens, start_focal
+from pipelines.tools.colmap_probing import (
+    MatchedPairs,
+    forget_pairs,
+    give_own_camera,
+    set_lens,
+    start_focal,
+)
 from pipelines.tools.colmap_results import (
     Correspondences,
     PairStatistics,
@@ -313,6 +319,10 @@ class Reconstructor:
         Their pairs must be matched again, which only verifies what was matched before.
         """
         set_lens(self.database, self.names, indices, lens, focal_px)
+
+    def give_own_camera(self, indices: Sequence[int], scale: float) -> None:
+        """Give images of one camera another one, see `colmap_probing`. Not while a call runs."""
+        give_own_camera(self.database, self.names, indices, scale)
 
     def start_focal(self, indices: Sequence[int], long_sides: float) -> int:
         """Let `map` start from a focal length where none is known, see `colmap_probing`. Not while

@@ -93,6 +93,34 @@ def set_lens(
                 opened.delete_two_view_geometry(*pair)
 
 
+def give_own_camera(
+    database: Path, names: Sequence[str], indices: Sequence[int], scale: float
+) -> None:
+    """Give images of one camera another one of their own, its focal length so many times as long.
+
+    Which matches are verified stays as it is: without a known focal length any lens fits.
+    """
+    with pycolmap.Database.open(database) as opened:
+        images = [_image(opened, names[index]) for index in indices]
+        before = opened.read_camera(images[0].camera_id)
+        camera = pycolmap.Camera.create_from_model_name(
+            0, before.model.name, scale * before.mean_focal_length(), before.width, before.height
+        )
+        camera.has_prior_focal_length = before.has_prior_focal_length
+        camera.camera_id = opened.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(camera.sensor_id)
+        rig_id = opened.write_rig(rig)
+        for image in images:
+            frame = opened.read_frame(image.frame_id)
+            frame.clear_data_ids()
+            frame.add_data_id(pycolmap.data_t(camera.sensor_id, image.image_id))
+            frame.rig_id = rig_id
+            opened.update_frame(frame)
+            image.camera_id = camera.camera_id
+            opened.update_image(image)
+
+
 def forget_pairs(database: Path, names: Sequence[str], pairs: Iterable[tuple[int, int]]) -> None:
     """Take what was verified of these pairs of indices out of the database: mapping does not know
     that they match."""
