@@ -20,10 +20,9 @@ _ENOUGH = 0.9
 """Share of a torn model's images that a mended one holds at least."""
 _UNFOLDED = 0.7
 """Share of the pairs that laid one side over another that cannot have matched, if they did."""
-
-
-_ONE_SIDE = 0.4
-"""Share of a folded model's images that one side holds at least for it to be worth having alone."""
+_ONE_SIDE, _LEAST_SIDE = 0.4, 0.1
+"""Share of a folded model's images that one side holds at least for it to be worth having alone,
+and any model for it to be a side."""
 
 Sides = tuple[frozenset[int], ...]
 _Mapped = Callable[[Reconstructor], list[SparseModel]]
@@ -141,7 +140,8 @@ def _unfolded(
             i in found.indices and j in found.indices for i, j in across
         )
         if one_side is None and is_alone:
-            sides = tuple(frozenset(model.indices) for model in models)
+            large = [one for one in models if len(one.indices) >= _LEAST_SIDE * before]
+            sides = tuple(frozenset(model.indices) for model in large)
             one_side = Mapping(models, apart, left_out=across, sides=sides)
     if one_side is not None:
         logger.info("nothing else joins the sides: the larger one is taken")
