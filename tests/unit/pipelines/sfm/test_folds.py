@@ -59,7 +59,10 @@ def of_two_sides(alike: int = 20, usual: int = 150) -> tuple[Matches, Counts]:
 
 
 def placed(poses: Floats, images: tuple[int, ...] = PLACED) -> SparseModel:
-    return model_of(poses[list(images)], images)
+    """A model with points on the thing that they go around."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 200)
+    points = np.stack([0.4 * np.cos(angles), 0.4 * np.sin(angles), angles / 7.0], axis=1)
+    return replace(model_of(poses[list(images)], images), points=points)
 
 
 def across(counts: Counts, images: tuple[int, ...] = PLACED) -> PairSet:
@@ -77,10 +80,23 @@ def test_sides_that_lie_over_each_other_are_told_by_what_should_match() -> None:
 def test_a_model_that_is_right_is_not_suspected() -> None:
     """All round; two sides with nothing between them; and one side, photographed twice over."""
     matches, counts = of_two_sides()
-    assert suspected_folds(model_of(true_poses()), matches, counts) == []
+    assert suspected_folds(placed(true_poses(), tuple(range(NUM))), matches, counts) == []
     assert suspected_folds(placed(true_poses()), matches, counts) == []
     matches, counts = of_two_sides(alike=100)
     assert suspected_folds(placed(folded(true_poses())), matches, counts) == []
+
+
+def test_close_ups_beside_pictures_of_the_whole_are_no_other_side() -> None:
+    """They share little with them, as they show a part; and so do stretches that hardly overlap."""
+    matches, counts = of_two_sides()
+    near = folded(true_poses())
+    near[HALF:, :, 3] = 0.45 * (near[HALF:, :, 3] - [0.0, 0.0, 0.45]) + [0.0, 0.0, 0.45]
+    assert suspected_folds(placed(near), matches, counts) == []
+    beside = folded(true_poses())
+    turn = np.radians(120.0)
+    about = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    beside[HALF:] = about @ beside[HALF:]
+    assert suspected_folds(placed(beside), matches, counts) == []
 
 
 @dataclass
