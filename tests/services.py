@@ -36,11 +36,14 @@ def missing(what: str) -> None:
 
 
 def free_port() -> int:
-    """A TCP port that nothing listens on."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        port: int = listener.getsockname()[1]
-        return port
+    """A TCP port that nothing listens on, and that no outgoing connection is given meanwhile: below
+    the range of these, from 32768 on, in which a port that is asked for as 0 lies."""
+    for _ in range(100):
+        port = 15_000 + secrets.randbelow(16_000)
+        with socket.socket() as listener, contextlib.suppress(OSError):
+            listener.bind(("127.0.0.1", port))
+            return port
+    raise RuntimeError("no port is free")
 
 
 def wait_for_port(port: int, process: subprocess.Popen[bytes], timeout_s: float = 20.0) -> None:
