@@ -26,8 +26,8 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipelines.sfm.agreement import FEWEST_MATCHES, Matches
-from pipelines.sfm.tears import Floats, PairSet
+from pipelines.sfm.agreement import FEWEST_MATCHES, Floats, Matches
+from pipelines.sfm.tears import PairSet
 from pipelines.tools.colmap_results import SparseModel
 
 _NEAR_DEG, _IN_VIEW_DEG, _MOST_POINTS = 15.0, 25.0, 5000

@@ -71,66 +71,71 @@ def mended(
     order = FilmOrder.of(clips)
     seen = reconstructor.verified(None, MOST_MATCHES)
     torn = tears(most, seen, order)
+    doubtful = _Doubtful(reconstructor, mapped, most, seen, order, logger)
     if torn:
         logger.info(
             "the path is torn between images %s: mapping by what is near in time",
             ", ".join(f"{i} and {j}" for i, j in torn),
         )
-        whole = _by_time(reconstructor, mapped, most, seen, order, logger)
-        return whole or Mapping(models, reconstructor, torn if is_film else ())
-    whole = _unfolded(reconstructor, mapped, most, seen, order, logger)
-    return whole or Mapping(models, reconstructor)
+        return _by_time(doubtful) or Mapping(models, reconstructor, torn if is_film else ())
+    return _unfolded(doubtful) or Mapping(models, reconstructor)
 
 
-def _by_time(
-    reconstructor: Reconstructor,
-    mapped: _Mapped,
-    most: SparseModel,
-    seen: Matches,
-    order: FilmOrder,
-    logger: logging.Logger,
-) -> Mapping | None:
+@dataclass(frozen=True)
+class _Doubtful:
+    """A mapping that may be wrong: by whose matches, how, and what came of it. seen: some matches
+    of all verified pairs."""
+
+    reconstructor: Reconstructor
+    mapped: _Mapped
+    most: SparseModel
+    seen: Matches
+    order: FilmOrder
+    logger: logging.Logger
+
+    def is_torn(self, model: SparseModel) -> bool:
+        """Whether the path of another model is."""
+        return bool(tears(model, self.seen, self.order))
+
+
+def _by_time(doubtful: _Doubtful) -> Mapping | None:
     """Along the film, and with those pairs far in time that its path makes possible; None where
     that holds too little."""
-    enough = _ENOUGH * len(most.indices)
-    far = frozenset(pair for pair in seen if order.is_far(pair))
+    reconstructor, mapped, seen = doubtful.reconstructor, doubtful.mapped, doubtful.seen
+    enough = _ENOUGH * len(doubtful.most.indices)
+    far = frozenset(pair for pair in seen if doubtful.order.is_far(pair))
     along = reconstructor.without_pairs(far)
     path_models = mapped(along)
     path = best_model(path_models)
-    if path is None or len(path.indices) < enough or tears(path, seen, order):
+    if path is None or len(path.indices) < enough or doubtful.is_torn(path):
         return None
     wrong = impossible(path, seen, far)
     looped = reconstructor.without_pairs(wrong)
     looped_models = mapped(looped)
     found = best_model(looped_models)
-    logger.info("%d of %d pairs far in time are left out", len(wrong), len(far))
-    if found is None or len(found.indices) < enough or tears(found, seen, order):
+    doubtful.logger.info("%d of %d pairs far in time are left out", len(wrong), len(far))
+    if found is None or len(found.indices) < enough or doubtful.is_torn(found):
         return Mapping(path_models, along, left_out=far)
     return Mapping(looped_models, looped, left_out=wrong)
 
 
-def _unfolded(
-    reconstructor: Reconstructor,
-    mapped: _Mapped,
-    most: SparseModel,
-    seen: Matches,
-    order: FilmOrder,
-    logger: logging.Logger,
-) -> Mapping | None:
+def _unfolded(doubtful: _Doubtful) -> Mapping | None:
     """Without pairs that should have matched better; None where there are none.
 
     Where other images join the sides there is room for more of them than before, and most of those
     pairs are impossible. Where nothing joins them each side is a model of its own: one that is
     right is worth more than both of them, one laid over the other.
     """
+    reconstructor, most, seen = doubtful.reconstructor, doubtful.most, doubtful.seen
+    logger = doubtful.logger
     counts = {(i, j): num for i, j, num in reconstructor.statistics().verified.tolist()}
     one_side: Mapping | None = None
     for across in suspected_folds(most, seen, counts):
         logger.info("one side may lie over another: mapping without %d pairs", len(across))
         apart = reconstructor.without_pairs(across)
-        models = mapped(apart)
+        models = doubtful.mapped(apart)
         found = best_model(models)
-        if found is None or tears(found, seen, order):
+        if found is None or doubtful.is_torn(found):
             continue
         placed, before = len(found.indices), len(most.indices)
         if placed > before and len(impossible(found, seen, across)) >= _UNFOLDED * len(across):
@@ -154,7 +159,7 @@ def _apart(reconstructor: Reconstructor, mapped: _Mapped, sides: Sides) -> Mappi
     across = frozenset(
         (i, j)
         for i, j, _ in reconstructor.statistics().verified.tolist()
-        if side_of.get(i, side_of.get(j)) != side_of.get(j, side_of.get(i))
+        if i in side_of and j in side_of and side_of[i] != side_of[j]
     )
     apart = reconstructor.without_pairs(across)
     models = mapped(apart)

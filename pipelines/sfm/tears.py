@@ -22,13 +22,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from pipelines.sfm.agreement import FEWEST_MATCHES, Matches, share_that_fits
 from pipelines.tools.colmap_rays import rays_through
 from pipelines.tools.colmap_results import SparseModel
 
-Floats = npt.NDArray[np.float64]
 PairSet = frozenset[tuple[int, int]]
 
 _WIDEST, _NARROWEST, _OF_CLIP = 8, 2, 8
@@ -115,18 +113,12 @@ def impossible(model: SparseModel, matches: Matches, pairs: Collection[tuple[int
         places = matches.get((i, j))
         if places is None or i not in row or j not in row or len(places[0]) < FEWEST_MATCHES:
             continue
-        if parallax_deg(model, (row[i], row[j]), places) >= WIDEST_PARALLAX_DEG:
+        rays = [
+            rays_through(model.cameras[model.camera_of[row[index]]], place)
+            @ model.world_from_camera[row[index], :, :3].T
+            for index, place in zip((i, j), places, strict=True)
+        ]
+        cosine = np.nanmedian((rays[0] * rays[1]).sum(axis=1))
+        if cosine <= np.cos(np.radians(WIDEST_PARALLAX_DEG)):
             found.add((i, j))
     return frozenset(found)
-
-
-def parallax_deg(model: SparseModel, rows: tuple[int, int], places: tuple[Floats, Floats]) -> float:
-    """The angle between the rays of two images, by their rows in the model, to what both are said
-    to show, in the median. places: [M, 2] each, in pixels."""
-    first, second = (
-        rays_through(model.cameras[model.camera_of[row]], place)
-        @ model.world_from_camera[row, :, :3].T
-        for row, place in zip(rows, places, strict=True)
-    )
-    cosine = np.nanmedian((first * second).sum(axis=1))
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
