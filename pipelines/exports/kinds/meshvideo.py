@@ -54,7 +54,6 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     from pipelines.exports.formats.glb import read_mesh
     from pipelines.exports.judged import mesh_of
     from pipelines.exports.paths.flight import held_upright, make_path, typical_lens
-    from pipelines.exports.paths.walls import Walls
     from pipelines.exports.shots import Lens, MeshStudio
 
     path = mesh_of(ctx.workspace.stage("mesh"))
@@ -68,8 +67,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     studio = MeshStudio(read_mesh(path))
     lenses = [scene.lens_of(image) for image in scene.cameras.images]
     images, own = held_upright(scene.cameras.images, typical_lens(lenses))
-    walls = Walls.of(path.parent)
-    flight = make_path(options, images, options.frames(), walls)
+    flight = make_path(options, images, options.frames(), path.parent)
     lens = Lens(options, own, flight)
     film = Film(
         options,

@@ -81,14 +81,12 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
         preview_index,
         typical_lens,
     )
-    from pipelines.exports.paths.walls import Walls
     from pipelines.exports.shots import Lens
     from pipelines.scene.depth_views import Pinhole
 
     lenses = [scene.lens_of(image) for image in scene.cameras.images]
     images, own = held_upright(scene.cameras.images, typical_lens(lenses))
-    walls = Walls.of(ctx.workspace.stage("mesh"))
-    flight = make_path(options, images, options.frames(), walls)
+    flight = make_path(options, images, options.frames(), ctx.workspace.stage("mesh"))
     lens = Lens(options, own, flight)
     together = options.layout == "side_by_side"
     names: tuple[str, ...] = ("rgb",) if together else options.outputs

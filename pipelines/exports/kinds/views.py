@@ -163,7 +163,6 @@ def _training_cameras(scene: TrainedScene, options: ViewsOptions) -> list[_Camer
 def _path_cameras(scene: TrainedScene, options: ViewsOptions, mesh: Path) -> list[_Camera]:
     """Those of the path's frames. mesh: its folder. Raises ExportError as the path does."""
     from pipelines.exports.paths.flight import lens_of_size, make_path, typical_lens
-    from pipelines.exports.paths.walls import Walls
     from pipelines.scene.depth_views import Pinhole
 
     images = scene.cameras.images
@@ -172,7 +171,7 @@ def _path_cameras(scene: TrainedScene, options: ViewsOptions, mesh: Path) -> lis
     if options.path == "camera_path" and options.camera_path is not None:
         file = options.camera_path
         lens, count = lens_of_size(own, file.render_width, file.render_height), file.frames()
-    flight = make_path(options, images, count, Walls.of(mesh))
+    flight = make_path(options, images, count, mesh)
     return [(flight.lens(index, lens), pose, None) for index, pose in enumerate(flight.poses)]
 
 

@@ -1,9 +1,9 @@
 """All camera paths of the video: one line for each. The file that it names holds the path.
 
 Light, as the API reads the names; `paths.flight` makes them. A path is a function `(images,
-options, num_frames, walls) -> Flight`: from the capture's posed images, `PathOptions` and what of
-the job's mesh is in the way, where it has one, to world poses. It raises ExportError (no_focus)
-where a capture has nothing to base it on.
+options, num_frames, mesh) -> Flight`: from the capture's posed images, `PathOptions` and the folder
+of the job's mesh, whose walls are in the way where it has one, to world poses. It raises
+ExportError (no_focus) where a capture has nothing to base it on.
 """
 
 from __future__ import annotations

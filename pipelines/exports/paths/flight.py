@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.exports.paths.catalogue import PATHS
 from pipelines.exports.paths.options import PathOptions
-from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.capture_order import nearest_pose_distance
 from pipelines.scene.depth_views import Pinhole
@@ -51,15 +51,16 @@ def make_path(
     options: PathOptions,
     images: Sequence[PosedImage],
     num_frames: int,
-    walls: Walls | None = None,
+    mesh: Path | None = None,
 ) -> Flight:
     """The path that options name, in so many frames; a file's own number counts for more.
 
-    walls: of the job's mesh, where it has one: what a path makes up for itself stays within them.
+    mesh: the folder of the job's mesh: what a path makes up for itself stays within its walls,
+    where there is one.
     """
     module_name, _, function_name = PATHS[options.path].partition(":")
     path: Callable[..., Flight] = getattr(importlib.import_module(module_name), function_name)
-    return path(images, options, num_frames, walls)
+    return path(images, options, num_frames, mesh)
 
 
 def held_upright(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from pipelines.exports.paths.flight import Flight, looking_at
 from pipelines.exports.paths.options import Keyframe, PathOptions
 from pipelines.exports.paths.spline import through
-from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.capture_order import capture_order
 from pipelines.scene.rotations import rotation_matrices
@@ -19,10 +19,10 @@ Floats = NDArray[np.float64]
 
 
 def through_keyframes(
-    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, mesh: Path | None = None
 ) -> Flight:
     """A flight through `video.keyframes`."""
-    del images, walls
+    del images, mesh
     frames = options.keyframes
     told = [one.fov_deg for one in frames if one.fov_deg is not None]
     ways = len(frames) - (0 if options.loop else 1)
@@ -46,10 +46,10 @@ def _pose(frame: Keyframe) -> Floats:
 
 
 def through_captured(
-    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, mesh: Path | None = None
 ) -> Flight:
     """A flight that passes every captured pose, in the order of the walk, as long at each."""
-    del walls
+    del mesh
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     if len(poses) < 2:
         return Flight(np.repeat(poses, num_frames, axis=0))

@@ -6,6 +6,7 @@ Source: nerfstudio, `cameras/camera_paths.py` and `viewer/render_panel.py`, vers
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from pipelines.exports.paths.flight import Flight
 from pipelines.exports.paths.options import PathOptions
 from pipelines.exports.paths.spline import through
-from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.rotations import quaternions, rotation_matrices
 
@@ -21,10 +21,10 @@ Floats = NDArray[np.float64]
 
 
 def as_in_file(
-    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, mesh: Path | None = None
 ) -> Flight:
     """The frames of the file, or so many along its keyframes where it has no other."""
-    del images, walls
+    del images, mesh
     file = options.camera_path
     assert file is not None, "options were checked"
     if file.camera_path:

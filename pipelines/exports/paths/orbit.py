@@ -7,6 +7,7 @@ circle passes where most of them stood; what none of them saw is shown as badly 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from pipelines.errors import ExportError
 from pipelines.exports.paths.flight import Flight, looking_at
 from pipelines.exports.paths.options import PathOptions
-from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.focus import find_focus
 
@@ -25,13 +25,13 @@ _STEEPEST = np.sin(np.radians(80.0))
 
 
 def orbit(
-    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, mesh: Path | None = None
 ) -> Flight:
     """Poses that look at the focus, or so far above it; the last is one step before the first.
 
     Raises ExportError (no_focus) where the cameras look at no common point.
     """
-    del walls
+    del mesh
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     focus = find_focus(poses)
     if focus is None:

@@ -16,6 +16,7 @@ This file knows only poses; lenses and rendering are left to who asks for the pa
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ _MIN_AGREEMENT = 1e-3
 
 
 def smooth_flight(
-    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, mesh: Path | None = None
 ) -> Flight:
     """World poses along the captured ones, in the order of the walk, on this side of the walls."""
     del options
@@ -57,6 +58,7 @@ def smooth_flight(
         poses, [image.file for image in images], [image.timestamp_s for image in images]
     )
     focus = find_focus(poses)
+    walls = None if focus is None or mesh is None else Walls.of(mesh)
     is_walk = focus is None and all(image.timestamp_s is not None for image in images)
     return Flight(smooth_path(poses[order], num_frames, focus, walls, is_walk=is_walk))
 

@@ -9,13 +9,13 @@ Source: LLFF, arXiv:1905.00889, its `render_path_spiral`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.exports.paths.flight import Flight, looking_at
 from pipelines.exports.paths.options import PathOptions
-from pipelines.exports.paths.walls import Walls
 from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.focus import find_focus
 
@@ -26,10 +26,10 @@ _DEPTHS = 0.5
 
 
 def spiral(
-    images: Sequence[PosedImage], options: PathOptions, num_frames: int, walls: Walls | None = None
+    images: Sequence[PosedImage], options: PathOptions, num_frames: int, mesh: Path | None = None
 ) -> Flight:
     """[num_frames] poses; the last is one step before the first."""
-    del walls
+    del mesh
     poses = np.asarray([image.world_from_camera for image in images], np.float64)
     away = np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=1)
     turned = np.linalg.norm(poses[:, :, 2] - poses[:, :, 2].mean(axis=0), axis=1)

@@ -12,8 +12,8 @@ from PIL import Image
 
 from pipelines.errors import Cancelled, ToolError
 from pipelines.exports.formats import mp4
-from pipelines.exports.paths import flight
-from pipelines.exports.paths.flight import Flight
+from pipelines.exports.paths import smooth
+from pipelines.exports.paths.smooth import Floats
 from pipelines.exports.paths.walls import Walls
 from pipelines.manifest import RunHooks
 from pipelines.options import OptionsError, resolve_options
@@ -40,12 +40,12 @@ def test_films_heed_the_jobs_mesh_where_it_has_one(
 ) -> None:
     heeded: list[Walls | None] = []
 
-    def record(*args: Any) -> Flight:
+    def record(*args: Any, **kwargs: Any) -> Floats:
         heeded.append(args[-1])
-        return made(*args)
+        return made(*args, **kwargs)
 
-    made = flight.make_path
-    monkeypatch.setattr(flight, "make_path", record)
+    made = smooth.smooth_path
+    monkeypatch.setattr(smooth, "smooth_path", record)
     wanted: dict[str, dict[str, Any]] = {
         "video": {"num_frames": 8},
         "views": {"cameras": "path", "num_frames": 2, "formats": ("png",)},
