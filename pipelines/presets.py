@@ -95,7 +95,13 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                     },
                     "pointcloud": {"num_points": 200_000},
                     "mesh": {"render_long_side_px": 240},
-                    "video": {"num_frames": 120, "long_side_px": 960, "field_px": 320},
+                    "video": {
+                        "turn_deg_per_s": 60,
+                        "min_seconds": 5,
+                        "max_seconds": 10,
+                        "long_side_px": 960,
+                        "field_px": 320,
+                    },
                 },
             ),
             Preset(
@@ -124,7 +130,13 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                         "render_long_side_px": 480,
                         "max_faces": 400_000,
                     },
-                    "video": {"num_frames": 144, "long_side_px": 1280, "field_px": 480},
+                    "video": {
+                        "turn_deg_per_s": 60,
+                        "min_seconds": 6,
+                        "max_seconds": 12,
+                        "long_side_px": 1280,
+                        "field_px": 480,
+                    },
                 },
             ),
             Preset(

@@ -48,18 +48,20 @@ class Film:
         """Of a picture, px."""
         return lens.size[0] * (len(self.outputs) if self.together else 1)
 
-    def told(self, num_frames: int, lens: Lens, folder: Path) -> dict[str, Any]:
+    def told(self, flight: Flight, lens: Lens, folder: Path) -> dict[str, Any]:
         """What the report says of it."""
         fps, made = self.options.frame_rate(), (*self.files.values(), self.pictures)
+        duration_s = len(flight) / fps
         return {
             "path": self.options.path,
             "camera": self.options.camera_type(),
             "codec": self.options.codec,
-            "num_frames": num_frames,
+            "num_frames": len(flight),
             "width": self.width(lens),
             "height": lens.size[1],
             "fps": fps,
-            "duration_s": round(num_frames / fps, 3),
+            "duration_s": round(duration_s, 3),
+            "turn_deg_per_s": round(flight.turned_deg() / duration_s, 1),
             "bytes": sum(
                 (folder / name).stat().st_size for name in made if (folder / name).exists()
             ),

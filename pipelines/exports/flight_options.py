@@ -5,6 +5,7 @@ Wrong requests are refused here, with the range, before anything is rendered.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -27,9 +28,28 @@ class FlightOptions(RenderingOptions, PathOptions):
     codec: Literal["h264", "hevc", "av1", "png"] = Field(
         "h264", description="png is a zip of pictures in place of videos."
     )
-    num_frames: int = Field(240, ge=8, le=MAX_FRAMES, description="Frames rendered.")
+    num_frames: int | None = Field(
+        None,
+        ge=8,
+        le=MAX_FRAMES,
+        description="Frames rendered; null, and without seconds, for as many as turn_deg_per_s "
+        "takes.",
+    )
     seconds: float | None = Field(
         None, gt=0, le=3600, description="In place of num_frames: how long it is."
+    )
+    turn_deg_per_s: float = Field(
+        45.0,
+        ge=1,
+        le=3600,
+        description="Where neither num_frames nor seconds is given: how fast the view turns, on "
+        "average, as far as min_seconds and max_seconds allow. Unit: degrees per second.",
+    )
+    min_seconds: float = Field(
+        10.0, gt=0, le=3600, description="How long it is at least, by turn_deg_per_s."
+    )
+    max_seconds: float = Field(
+        30.0, gt=0, le=3600, description="How long it is at most, by turn_deg_per_s."
     )
     fps: float = Field(24.0, ge=1, le=120, description="Frames per second.")
     long_side_px: int = Field(
@@ -53,10 +73,16 @@ class FlightOptions(RenderingOptions, PathOptions):
     def _is_no_larger_than_it_may_be(self) -> FlightOptions:
         if (self.width_px is None) != (self.height_px is None):
             raise ValueError("width_px and height_px belong together")
-        if not 2 <= self.frames() <= MAX_FRAMES:
-            raise ValueError(
-                f"the video would have {self.frames()} frames; 2 to {MAX_FRAMES} are possible"
-            )
+        if self.min_seconds > self.max_seconds:
+            raise ValueError("min_seconds must not be more than max_seconds")
+        known = self.frames()
+        for count in (
+            (self.frames_for(0.0), self.frames_for(math.inf)) if known is None else [known]
+        ):
+            if not 2 <= count <= MAX_FRAMES:
+                raise ValueError(
+                    f"the video would have {count} frames; 2 to {MAX_FRAMES} are possible"
+                )
         if self.codec != "png" and self.num_side_by_side() * self.size()[0] > 2 * MAX_SIDE_PX:
             raise ValueError(
                 f"side by side the video would be wider than {2 * MAX_SIDE_PX} px, which no codec "
@@ -95,13 +121,18 @@ class FlightOptions(RenderingOptions, PathOptions):
             return self.camera_path.camera_type
         return self.camera
 
-    def frames(self) -> int:
-        """How many frames there are, as far as they are not listed one by one."""
+    def frames(self) -> int | None:
+        """How many frames there are; None where that is left to how far the way turns."""
         if self.path == "camera_path" and self.camera_path is not None:
             return self.camera_path.frames()
         durations = self.durations_s()
         seconds = sum(durations) if durations else self.seconds
         return self.num_frames if seconds is None else round(seconds * self.fps)
+
+    def frames_for(self, turned_deg: float) -> int:
+        """How many a way has that turns so far, where it is left to that."""
+        seconds = max(self.min_seconds, min(turned_deg / self.turn_deg_per_s, self.max_seconds))
+        return round(seconds * self.fps)
 
     def frame_rate(self) -> float:
         """Frames per second."""

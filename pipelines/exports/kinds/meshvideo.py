@@ -53,7 +53,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     from pipelines.exports.filming import Film, make_film
     from pipelines.exports.formats.glb import read_mesh
     from pipelines.exports.judged import mesh_of
-    from pipelines.exports.paths.flight import held_upright, make_path, typical_lens
+    from pipelines.exports.paths.flight import filmed_path, held_upright, typical_lens
     from pipelines.exports.shots import Lens, MeshStudio
 
     path = mesh_of(ctx.workspace.stage("mesh"))
@@ -67,7 +67,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
     studio = MeshStudio(read_mesh(path))
     lenses = [scene.lens_of(image) for image in scene.cameras.images]
     images, own = held_upright(scene.cameras.images, typical_lens(lenses))
-    flight = make_path(options, images, options.frames(), path.parent)
+    flight = filmed_path(options, images, path.parent)
     lens = Lens(options, own, flight)
     film = Film(
         options,
@@ -77,12 +77,12 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
         together=len(options.outputs) > 1,
     )
     make_film(scene, film, flight, lens, ctx, {"mesh": studio.picture})
-    return film.told(len(flight), lens, ctx.out)
+    return film.told(flight, lens, ctx.out)
 
 
 EXPORT = Export(
     kind="meshvideo",
-    version=4,
+    version=5,
     reads=("mesh",),
     run=run,
     options=MeshVideoOptions,

@@ -76,8 +76,8 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
 
     from pipelines.exports.filming import Film, make_film
     from pipelines.exports.paths.flight import (
+        filmed_path,
         held_upright,
-        make_path,
         preview_index,
         typical_lens,
     )
@@ -86,7 +86,7 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
 
     lenses = [scene.lens_of(image) for image in scene.cameras.images]
     images, own = held_upright(scene.cameras.images, typical_lens(lenses))
-    flight = make_path(options, images, options.frames(), ctx.workspace.stage("mesh"))
+    flight = filmed_path(options, images, ctx.workspace.stage("mesh"))
     lens = Lens(options, own, flight)
     together = options.layout == "side_by_side"
     names: tuple[str, ...] = ("rgb",) if together else options.outputs
@@ -115,7 +115,7 @@ def run(scene: TrainedScene, options: VideoOptions, ctx: StageContext) -> dict[s
         picture = studio.rendered_at(scene.trained_long_side_px).picture(shown, pose)
     Image.fromarray(picture).save(ctx.out / "preview.jpg", quality=_PREVIEW_QUALITY)
     with_mesh = studio is not None and studio.has_mesh
-    return {**film.told(len(flight), lens, ctx.out), "mesh_detail": with_mesh}
+    return {**film.told(flight, lens, ctx.out), "mesh_detail": with_mesh}
 
 
 def _studio(
@@ -141,7 +141,7 @@ _PLAYER = "any browser or player"
 
 EXPORT = Export(
     kind="video",
-    version=8,
+    version=9,
     reads=("mesh",),
     run=run,
     options=VideoOptions,

@@ -242,7 +242,7 @@ def _transforms(frames: list[dict[str, Any]], unit: float, scene: TrainedScene) 
 
 EXPORT = Export(
     kind="views",
-    version=3,
+    version=4,
     reads=("mesh",),
     run=run,
     options=ViewsOptions,

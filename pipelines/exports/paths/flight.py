@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.exports.flight_options import FlightOptions
 from pipelines.exports.paths.catalogue import PATHS
 from pipelines.exports.paths.options import PathOptions
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
@@ -21,6 +22,8 @@ Floats = NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STEEP = 1e-4
+_TRIED_FRAMES = 240
+"""In which a path's turning is measured, before it has its own number."""
 _ON_THEIR_SIDE, _CLEARLY = 0.3, 2.0
 """Median height of cameras' X axes, and how many times that of their Y axes it is, from which
 pictures are turned for who watches: from steeply above both are low."""
@@ -38,6 +41,12 @@ class Flight:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def turned_deg(self) -> float:
+        """How far the cameras turn on the way, degrees."""
+        axes = self.poses[:, :, :3]
+        trace = np.einsum("nij,nij->n", axes[1:], axes[:-1])
+        return float(np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))).sum())
 
     def lens(self, index: int, lens: Pinhole) -> Pinhole:
         """The lens of one frame, from that of the video."""
@@ -61,6 +70,19 @@ def make_path(
     module_name, _, function_name = PATHS[options.path].partition(":")
     path: Callable[..., Flight] = getattr(importlib.import_module(module_name), function_name)
     return path(images, options, num_frames, mesh)
+
+
+def filmed_path(
+    options: FlightOptions, images: Sequence[PosedImage], mesh: Path | None = None
+) -> Flight:
+    """The path that options name, in as many frames as they say or as it turns.
+
+    mesh: as for `make_path`.
+    """
+    count = options.frames()
+    if count is None:
+        count = options.frames_for(make_path(options, images, _TRIED_FRAMES, mesh).turned_deg())
+    return make_path(options, images, count, mesh)
 
 
 def held_upright(

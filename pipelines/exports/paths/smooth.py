@@ -35,8 +35,12 @@ Floats = NDArray[np.float64]
 _SMOOTHING_SHARE, _SMOOTHING_TURN_RAD = 1.0 / 30.0, 0.42
 """What is smoothed over: a thirtieth of the way; of a film that looks about no more than that is of
 a way that goes round once, in radians of the metric: of a walk through five rooms a thirtieth leads
-through walls. Photos, in whatever order they are, would have the camera jump from one to the next.
+through walls. Photos from here and there would have the camera jump from one to the next.
 """
+_MOST = 0.75
+"""Of pictures whose times nobody knows, the share that are no farther from the one before than is
+smoothed over in a film, where they are a walk's. Measured at that share: .22 rad for a walk sent as
+pictures, .48 to .62 for photos of rooms and a desk."""
 _STEEP, _LEVEL = 0.2, 0.6
 """Of the world's up, what lies in a picture's plane: up to this it has no upper side, and from this
 on it has. Between them a horizon counts by and by."""
@@ -59,7 +63,8 @@ def smooth_flight(
     )
     focus = find_focus(poses)
     walls = None if focus is None or mesh is None else Walls.of(mesh)
-    is_walk = focus is None and all(image.timestamp_s is not None for image in images)
+    is_film = all(image.timestamp_s is not None for image in images)
+    is_walk = focus is None and (is_film or _follow_each_other(poses[order]))
     return Flight(smooth_path(poses[order], num_frames, focus, walls, is_walk=is_walk))
 
 
@@ -83,7 +88,8 @@ def smooth_path(
     pictures, so has the path.
     walls: what a place that the distance pushes away from its neighbours must not lie behind; there
     the distance is kept as far as there is room.
-    is_walk: whether poses follow each other in a film that looks about, so that the way is theirs.
+    is_walk: whether poses follow each other as those of a film that looks about do, so that the way
+    is theirs.
     Returns [num_frames, 3, 4] with exact rotations. Raises ValueError without poses or frames.
     """
     if len(poses) == 0 or num_frames < 1:
@@ -105,6 +111,13 @@ def smooth_path(
     # Evenly spaced along the smoothed way: constant speed.
     at = np.interp(np.linspace(0.0, s_dense[-1], num_frames), s_dense, s_at)
     return _windowed(poses, s, at, width, focus, np.interp(at, s_at, pushed))
+
+
+def _follow_each_other(poses: Floats) -> bool:
+    """Whether most poses are as near to the one before as a film's: pictures of a walk."""
+    turn = turn_length(poses)
+    steps = np.diff(_arc_length(poses, turn))
+    return len(steps) > 0 and bool(np.quantile(steps, _MOST) <= turn * _SMOOTHING_TURN_RAD)
 
 
 def _arc_length(poses: Floats, turn: float) -> Floats:

@@ -333,6 +333,8 @@ def test_a_failing_encoder_leaves_no_half_written_file(
         ({"fps": 0}, "greater than or equal to 1"),
         ({"seconds": 0}, "greater than 0"),
         ({"seconds": 3000, "fps": 60}, "180000 frames; 2 to 20000"),
+        ({"max_seconds": 3000, "fps": 60}, "180000 frames; 2 to 20000"),
+        ({"min_seconds": 31}, "min_seconds must not be more than max_seconds"),
         ({"outputs": []}, "at least 1"),
         ({"outputs": ["rgb", "semantics"]}, "'rgb', 'depth', 'normals' or 'accumulation'"),
         ({"outputs": OUTPUTS, "layout": "side_by_side", "long_side_px": 8192}, "wider than 16384"),

@@ -7,8 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pipelines.exports.kinds.video import VideoOptions
 from pipelines.exports.paths.flight import (
     Flight,
+    filmed_path,
     held_upright,
     lens_of_size,
     looking_at,
@@ -141,3 +143,36 @@ def test_looking_straight_down_is_no_spin() -> None:
     assert np.allclose(turns.transpose(0, 2, 1) @ turns, np.eye(3))
     assert np.allclose(np.linalg.det(turns), 1.0)
     assert np.allclose(-turns[:, :, 2], [[0, 0, -1], [0, -1, 0], [-1, 0, 0]])
+
+
+def _walked(rounds: int) -> list[PosedImage]:
+    """A film that goes round a thing so often."""
+    angles = np.linspace(0.0, 2.0 * np.pi * rounds, 24 * rounds)
+    places = np.stack([3.0 * np.cos(angles), 3.0 * np.sin(angles), np.ones(len(angles))], axis=1)
+    poses = looking_at(places, np.zeros(3))
+    return [
+        PosedImage(f"{index}.jpg", 0, tuple(map(tuple, pose.tolist())), float(index))
+        for index, pose in enumerate(poses)
+    ]
+
+
+def test_a_way_that_turns_more_is_filmed_for_longer() -> None:
+    options = VideoOptions(turn_deg_per_s=60.0, min_seconds=2.0, max_seconds=20.0)
+    once, thrice = (filmed_path(options, _walked(rounds)) for rounds in (1, 3))
+    assert once.turned_deg() == pytest.approx(360.0, abs=40.0)
+    assert len(once) == pytest.approx(once.turned_deg() / 60.0 * 24.0, rel=0.05)
+    assert len(thrice) == pytest.approx(3 * len(once), rel=0.1)
+    # And no longer or shorter than is wanted, or as long as somebody says.
+    brief = options.model_copy(update={"max_seconds": 4.0})
+    assert len(filmed_path(brief, _walked(3))) == 96
+    assert len(filmed_path(options, _walked(1)[:2])) == 48
+    for told, frames in (({"num_frames": 31}, 31), ({"seconds": 1.0}, 24)):
+        assert len(filmed_path(options.model_copy(update=told), _walked(3))) == frames
+
+
+def test_how_far_a_way_turns_is_told_in_any_direction() -> None:
+    pose = looking_at(np.array([[2.0, 0.0, 0.0]]), np.zeros(3))[0]
+    assert Flight(pose[None]).turned_deg() == 0.0
+    rolled = pose.copy()
+    rolled[:, :2] = pose[:, :2] @ np.array([[0.0, -1.0], [1.0, 0.0]])
+    assert Flight(np.stack([pose, rolled, pose])).turned_deg() == pytest.approx(180.0)

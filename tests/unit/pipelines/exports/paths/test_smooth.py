@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipelines.exports.paths.smooth import Floats, smooth_path
+from pipelines.exports.paths.options import PathOptions
+from pipelines.exports.paths.smooth import Floats, smooth_flight, smooth_path
 from pipelines.exports.paths.walls import Walls
 from pipelines.exports.surface.surface_file import KeptSurface
+from pipelines.scene.cameras_file import PosedImage
 from pipelines.scene.capture_order import capture_order, nearest_pose_distance
 from pipelines.scene.focus import find_focus
 from tests.unit.pipelines.scene.synthetic_views import arc, look_at
@@ -234,8 +236,12 @@ def test_the_horizon_of_pictures_on_their_side_stays_where_it_was() -> None:
     np.testing.assert_allclose(tilt, np.degrees(np.arctan2(poses[0, 2, 0], poses[0, 2, 1])), atol=5)
 
 
-def test_a_film_through_rooms_goes_through_their_doors() -> None:
-    """Five rooms of 3.2 by 3.4 m along a corridor, doors of 0.8 m, a walk in, about and out."""
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_film_through_rooms_goes_through_their_doors(timed: bool) -> None:
+    """Whether it was sent as a film or as its pictures.
+
+    Five rooms of 3.2 by 3.4 m along a corridor, doors of 0.8 m, a walk in, about and out.
+    """
     corners = [(-0.5, 0.0)]
     doors = [1.6 + 3.3 * room for room in range(5)]
     for door in doors:
@@ -252,8 +258,11 @@ def test_a_film_through_rooms_goes_through_their_doors() -> None:
     eyes = [np.array([x, y, 1.5]) for x, y, _ in poses]
     aims = [np.array([np.cos(turn), np.sin(turn), -0.1]) for _, _, turn in poses]
     walked = np.stack([look_at(e, e + a) for e, a in zip(eyes, aims, strict=True)])
-    path = smooth_path(walked, 480, is_walk=True)
-    x, y = path[:, :2, 3].T
+    images = [
+        PosedImage(f"{index}.jpg", 0, tuple(map(tuple, pose.tolist())), index if timed else None)
+        for index, pose in enumerate(walked)
+    ]
+    x, y = smooth_flight(images, PathOptions(), 480).poses[:, :2, 3].T
     crossing = np.flatnonzero(np.diff(y > 0.6))
     assert len(crossing) == 10
     assert np.abs(x[crossing, None] - doors).min(axis=1).max() < 0.4
