@@ -45,7 +45,7 @@ _EXPLAINS = "pipelines.stages.check:write_failed_check"
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=14,
+        version=15,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",

@@ -14,6 +14,7 @@ from pipelines.captures.photo_choice import choose_photos
 from pipelines.captures.photo_masks import PhotoMasks, find_masks
 from pipelines.captures.pictures import Picture, PictureWriter
 from pipelines.captures.record import Found
+from pipelines.captures.rims import mask_rims
 from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -46,6 +47,9 @@ def write_photos(
         upright=True,
         minimum=MIN_IMAGES,
     )
+    plain = [one for one in pictures if not (one.mask or one.cut or one.views)]
+    rims = mask_rims(ctx.out, plain, ctx)
+    pictures = [replace(one, mask=rims.get(one.file, one.mask)) for one in pictures]
     sizes = sorted({(picture.width, picture.height) for picture in pictures})
     return Found(
         images=[picture.as_dict() for picture in pictures],
@@ -53,6 +57,7 @@ def write_photos(
             "num_sizes": len(sizes),
             "largest": list(max(sizes)),
             **masks.details(),
+            **({"num_rims": len(rims)} if rims else {}),
         },
         warnings=warnings,
     )

@@ -5,12 +5,14 @@
     camera: fx fy cx cy width height blur_score t_00 .. t_23 (row-major world_from_camera [3, 4])
 
     keyframes/depth/<us>.png    16 bits, millimetres along the camera's axis, 0 where unknown
-    keyframes/confidence/<us>.png   8 bits, the size of the depth: 0, 127 or 255, as ARKit rates it
+    keyframes/confidence/<us>.png   8 bits, the size of the depth: 0, 54 or 127, or 255, as ARKit
+    rates it
 
 The `corrected_` ones are there unless the session was too large for Polycam's optimiser, and are
-better. World: ARKit's, metres, +Y up; turned to +Z up here. Only depth of the highest confidence is
-kept: what is below is drawn across edges. No real export was at hand: the layout is that of the
-public readers of the format. That depth fits the corrected pictures is nerfstudio's reading of it.
+better. Exports are told of that have corrected cameras without corrected pictures: then poses are
+those, and lenses the phone's. World: ARKit's, metres, +Y up; turned to +Z up here. Only depth of
+the highest confidence is kept: what is below is drawn across edges. Corrected pictures have a black
+rim (`captures.rims`). Depth fits them: in a real export to 1 or 2 % of the focal length.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import PurePosixPath
+from typing import NamedTuple
 
 from pipelines.captures.archive_rules import shown
 from pipelines.captures.contents import PosedPictures, PosedSource, SensorDepth
@@ -41,8 +44,20 @@ _MIN_SHARP = 20
 _MIN_SHARP_SHARE = 0.5
 _KEYFRAMES = "keyframes/"
 _MILLIMETRE = 0.001
+
+
+class _Folders(NamedTuple):
+    """Of pictures and of their cameras, below `keyframes/`."""
+
+    images: str
+    cameras: str
+
+
+_CORRECTED = _Folders("corrected_images", "corrected_cameras")
+_CORRECTED_POSES = _Folders("images", "corrected_cameras")
+_OF_THE_PHONE = _Folders("images", "cameras")
 _CONFIDENT = 200
-"""Of 0, 127 and 255 the last, with room for what an app might call it."""
+"""Of 0, 54 or 127, and 255 the last, with room for what an app might call it."""
 
 
 def claims(listing: Listing) -> Claim | None:
@@ -61,25 +76,31 @@ def read(archive: CaptureArchive, claim: Claim) -> PosedPictures:
     """
     root = claim.root
     warnings: list[str] = []
-    corrected = True
-    pairs, num_unposed = _pairs(archive, root, "corrected_")
-    if not pairs:
-        corrected = False
-        pairs, num_unposed = _pairs(archive, root, "")
+    for taken in (_CORRECTED, _CORRECTED_POSES, _OF_THE_PHONE):
+        pairs, num_unposed = _pairs(archive, root, taken)
+        if pairs:
+            break
+    else:
+        raise missing("The export has pictures, but no camera file belongs to any of them.")
+    corrected = taken is not _OF_THE_PHONE
+    if not corrected:
         warnings.append(
             "The export has no corrected poses; those of the phone drift over long walks."
         )
-    if not pairs:
-        raise missing("The export has pictures, but no camera file belongs to any of them.")
+    lenses = {}
+    if taken is _CORRECTED_POSES:
+        lenses = dict(_pairs(archive, root, _OF_THE_PHONE)[0])
     depths = _depths(archive, root, [image for image, _ in pairs], warnings)
     blurs: dict[str, float | None] = {}
     sources, failures = each_frame(
         archive,
         dict(pairs),
-        lambda image, camera: _frame(archive, image, camera, blurs, depths.get(image)),
+        lambda image, camera: _frame(
+            archive, image, camera, lenses.get(image, camera), blurs, depths.get(image)
+        ),
     )
-    paired = {name for pair in pairs for name in pair}
-    _set_aside(archive, root, corrected, paired, depths)
+    paired = {name for pair in pairs for name in pair} | set(lenses.values())
+    _set_aside(archive, root, taken, paired, depths)
     of_frames = {name for source in sources for name in source.depth_files}
     of_all = {name for depth in depths.values() for name in depth.files}
     archive.set_aside(of_all - of_frames, "their pictures are left out")
@@ -131,37 +152,38 @@ def _depths(
 def _set_aside(
     archive: CaptureArchive,
     root: str,
-    corrected: bool,
+    taken: _Folders,
     paired: set[str],
     depths: Mapping[str, SensorDepth],
 ) -> None:
     """Say of the export's files beside the paired ones why they are not used."""
     paired = paired | {name for depth in depths.values() for name in depth.files}
-    taken = ("corrected_images", "corrected_cameras") if corrected else ("images", "cameras")
     whys = {
         "depth": "no picture that is used goes with them",
         "confidence": "no depth map that is used goes with them",
         "images": "corrected ones are taken instead",
         "cameras": "corrected ones are taken instead",
-        taken[0]: "without a camera file",
-        taken[1]: "without a picture",
+        taken.images: "without a camera file",
+        taken.cameras: "without a picture",
     }
     for folder, why in whys.items():
         whole = f"{root}{_KEYFRAMES}{folder}"
         archive.set_aside([name for name in archive.names - paired if _folder(name) == whole], why)
 
 
-def _pairs(archive: CaptureArchive, root: str, prefix: str) -> tuple[list[tuple[str, str]], int]:
+def _pairs(
+    archive: CaptureArchive, root: str, folders: _Folders
+) -> tuple[list[tuple[str, str]], int]:
     """(picture, camera file) of equal stem, and how many pictures have no camera file."""
     cameras = {
         PurePosixPath(name).stem: name
         for name in archive.names
-        if _folder(name) == f"{root}keyframes/{prefix}cameras" and name.endswith(".json")
+        if _folder(name) == f"{root}{_KEYFRAMES}{folders.cameras}" and name.endswith(".json")
     }
     images = {
         PurePosixPath(name).stem: name
         for name in archive.images
-        if _folder(name) == f"{root}keyframes/{prefix}images"
+        if _folder(name) == f"{root}{_KEYFRAMES}{folders.images}"
     }
     both = sorted(cameras.keys() & images.keys(), key=lambda stem: (len(stem), stem))
     return [(images[stem], cameras[stem]) for stem in both], len(images) - len(both)
@@ -171,25 +193,41 @@ def _folder(name: str) -> str:
     return name.rpartition("/")[0]
 
 
+class _Camera:
+    """A camera file."""
+
+    def __init__(self, archive: CaptureArchive, name: str) -> None:
+        self._what = f'"{shown(name)}"'
+        self._raw = archive.read_json(name)
+        if not isinstance(self._raw, dict):
+            raise malformed(f"{self._what} is not a camera.")
+
+    def has(self, key: str) -> bool:
+        """Whether it says something of it."""
+        return key in self._raw
+
+    def value(self, key: str) -> float:
+        """A number of it. Raises CaptureError poses_malformed."""
+        if key not in self._raw:
+            raise malformed(f"{self._what} has no {key}.")
+        return number(self._raw[key], f"{key} of {self._what}")
+
+
 def _frame(
     archive: CaptureArchive,
     image: str,
     camera: str,
+    lens_of: str,
     blurs: dict[str, float | None],
     depth: SensorDepth | None,
 ) -> PosedSource:
-    """A keyframe; its blur score, where it has one (low = blurred), goes into `blurs`."""
-    what = f'"{shown(camera)}"'
-    raw = archive.read_json(camera)
-    if not isinstance(raw, dict):
-        raise malformed(f"{what} is not a camera.")
+    """A keyframe; its blur score, where it has one (low = blurred), goes into `blurs`.
 
-    def value(key: str) -> float:
-        if key not in raw:
-            raise malformed(f"{what} has no {key}.")
-        return number(raw[key], f"{key} of {what}")
-
-    pose = tuple(tuple(value(f"t_{row}{column}") for column in range(4)) for row in range(3))
+    camera, lens_of: files with its pose and with its lens.
+    """
+    posed = _Camera(archive, camera)
+    pose = tuple(tuple(posed.value(f"t_{row}{column}") for column in range(4)) for row in range(3))
+    value = _Camera(archive, lens_of).value
     lens = Intrinsics(
         width=round(value("width")),
         height=round(value("height")),
@@ -199,7 +237,7 @@ def _frame(
         cy=value("cy"),
     )
     stem = PurePosixPath(image).stem
-    blurs[image] = value("blur_score") if "blur_score" in raw else None
+    blurs[image] = posed.value("blur_score") if posed.has("blur_score") else None
     return PosedSource(
         name=image,
         lens=partial(resized, lens),

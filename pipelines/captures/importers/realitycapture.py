@@ -1,8 +1,12 @@
-"""RealityCapture's "Internal/External camera parameters" (CSV) beside the pictures.
+"""RealityCapture's, now RealityScan's, "Internal/External camera parameters" (CSV) beside the
+pictures.
 
     #cameras 24                                                   not always there
     #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2    in any order, those from px on
     IMG_1.jpg,1.5,...                                             may be absent
+
+RealityScan 2 has yaw, f_35mm, px_norm and py_norm in place of heading, f, px and py, taken to mean
+the same.
 
 Degrees: world_from_camera = Rz(-heading) Rx(pitch) Ry(roll), OpenGL camera, +Z up, place (x, y,
 alt). f is that of a camera whose longer side is 36 mm; (px, py) is the principal point, from the
@@ -32,6 +36,8 @@ from pipelines.scene.natural_order import natural_key
 _HEAD = re.compile(rb"(\xef\xbb\xbf)?(#cameras[^\r\n]*[\r\n]+)?#name\s*,([^\r\n]*)", re.IGNORECASE)
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_CALLED = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
+"""RealityScan 2's names of columns."""
 _FILM_MM = 36.0
 
 
@@ -116,12 +122,13 @@ def _rows(data: bytes, file: str) -> list[_Row]:
 
 
 def _header(words: list[str], file: str) -> list[str]:
-    header = [word.strip().lstrip("#").lower() for word in words]
+    named = [word.strip().lstrip("#").lower() for word in words]
+    header = [_CALLED.get(name, name) if _CALLED.get(name) not in named else name for name in named]
     lacking = [name for name in _NEEDED if name not in header]
     if lacking:
         raise missing(
             f"{file} lacks the columns {', '.join(lacking)}.",
-            'Export "Internal/External camera parameters" from RealityCapture.',
+            'Export "Internal/External camera parameters" from RealityCapture or RealityScan.',
         )
     return header
 

@@ -40,6 +40,25 @@ def test_polycam_prefers_corrected_poses(tmp_path: Path) -> None:
     assert (summary["corrected"], len(cameras(ctx).images)) == (True, 4)
 
 
+def test_polycam_takes_corrected_poses_without_corrected_pictures(tmp_path: Path) -> None:
+    """With the phone's lens, which is that of its pictures."""
+    corrected = {
+        name: text.replace('"fx": 60.0', '"fx": 61.5').replace('"t_13": 0.5', '"t_13": 0.7')
+        for name, text in polycam_files(6).items()
+        if isinstance(text, str)
+    }
+    summary, ctx = ingest(tmp_path, polycam_files(6, corrected=False) | corrected)
+    file = cameras(ctx)
+    assert (summary["corrected"], len(file.images)) == (True, 6)
+    assert {image.world_from_camera[2][3] for image in file.images} == {0.7}
+    assert [lens.fl_x for lens in file.cameras] == [60.0]
+    assert not any(".json" in warning or "drift" in warning for warning in summary["warnings"][:-1])
+    # And cameras of which only the phone's are there stay the phone's.
+    lone = {name: data for name, data in corrected.items() if not name.endswith("1000000.json")}
+    _, ctx = ingest(tmp_path / "lone", polycam_files(6, corrected=False) | lone)
+    assert len(cameras(ctx).images) == 5
+
+
 def test_polycam_drops_blurred_frames_if_enough_remain(tmp_path: Path) -> None:
     scores = [10.0 if n % 5 == 0 else 90.0 for n in range(30)]
     summary, _ = ingest(tmp_path, polycam_files(30, blur_scores=scores))

@@ -45,6 +45,16 @@ def test_poses_and_lenses_are_those_that_were_written(
     assert_lenses(ctx, TRUTH, 1e-9)
 
 
+def test_columns_may_be_named_as_realityscan_does(tmp_path: Path) -> None:
+    head, rows = realitycapture_csv(TRUTH, count=False).split("\r\n", 1)
+    renamed = head.replace("heading", "yaw").replace(",f,px,py,", ",f_35mm,px_norm,py_norm,")
+    assert renamed.split(",")[4:10] == ["yaw", "pitch", "roll", "f_35mm", "px_norm", "py_norm"]
+    summary, ctx = ingest(tmp_path, PICTURES | {"scan.csv": f"{renamed}\r\n{rows}".encode()})
+    assert summary["num_posed"] == 10
+    assert_poses(ctx, TRUTH)
+    assert_lenses(ctx, TRUTH, 1e-9)
+
+
 def test_a_camera_without_angles_looks_down_with_north_above(tmp_path: Path) -> None:
     """What the angles mean, by hand: pitch 90 looks to the horizon, heading 90 to the east,
     roll is about the camera's own upper edge."""
