@@ -41,6 +41,9 @@ _MOST = 0.75
 """Of pictures whose times nobody knows, the share that are no farther from the one before than is
 smoothed over in a film, where they are a walk's. Measured at that share: .22 rad for a walk sent as
 pictures, .48 to .62 for photos of rooms and a desk."""
+_GAP_RAD, _GAP_STEPS = 0.8, 6.0
+"""A step between two poses of a film that is longer, in radians of the metric, and than so many of
+its median steps, is a gap."""
 _STEEP, _LEVEL = 0.2, 0.6
 """Of the world's up, what lies in a picture's plane: up to this it has no upper side, and from this
 on it has. Between them a horizon counts by and by."""
@@ -65,7 +68,9 @@ def smooth_flight(
     walls = None if focus is None or mesh is None else Walls.of(mesh)
     is_film = all(image.timestamp_s is not None for image in images)
     is_walk = focus is None and (is_film or _follow_each_other(poses[order]))
-    return Flight(smooth_path(poses[order], num_frames, focus, walls, is_walk=is_walk))
+    return Flight(
+        smooth_path(poses[order], num_frames, focus, walls, is_walk=is_walk, is_film=is_film)
+    )
 
 
 def smooth_path(
@@ -75,6 +80,7 @@ def smooth_path(
     walls: Walls | None = None,
     *,
     is_walk: bool = False,
+    is_film: bool = False,
 ) -> Floats:
     """`num_frames` poses along a smooth path through `poses`, at nearly constant speed.
 
@@ -90,6 +96,7 @@ def smooth_path(
     the distance is kept as far as there is room.
     is_walk: whether poses follow each other as those of a film that looks about do, so that the way
     is theirs.
+    is_film: whether they are a film's; where these break off the path jumps to where they go on.
     Returns [num_frames, 3, 4] with exact rotations. Raises ValueError without poses or frames.
     """
     if len(poses) == 0 or num_frames < 1:
@@ -108,6 +115,8 @@ def smooth_path(
         pushed = _room(poses, s, s_at, width, focus, walls)
         dense = _windowed(poses, s, s_at, width, focus, pushed)
     s_dense = _arc_length(dense, turn)
+    if is_film:
+        s_dense = _without_gaps(s_dense, s_at, s, turn)
     # Evenly spaced along the smoothed way: constant speed.
     at = np.interp(np.linspace(0.0, s_dense[-1], num_frames), s_dense, s_at)
     return _windowed(poses, s, at, width, focus, np.interp(at, s_at, pushed))
@@ -118,6 +127,18 @@ def _follow_each_other(poses: Floats) -> bool:
     turn = turn_length(poses)
     steps = np.diff(_arc_length(poses, turn))
     return len(steps) > 0 and bool(np.quantile(steps, _MOST) <= turn * _SMOOTHING_TURN_RAD)
+
+
+def _without_gaps(length: Floats, at: Floats, s: Floats, turn: float) -> Floats:
+    """The length [M] of a way at `at` [M], where gaps between poses at `s` [N] have next to none.
+
+    A film's poses are near each other, unless some were not found: what it saw there is not known.
+    """
+    steps = np.diff(s)
+    gaps = steps > max(turn * _GAP_RAD, _GAP_STEPS * float(np.median(steps)))
+    inside = gaps[np.clip(np.searchsorted(s, 0.5 * (at[1:] + at[:-1])) - 1, 0, len(steps) - 1)]
+    short: Floats = np.concatenate(([0.0], np.cumsum(np.diff(length) * np.where(inside, 1e-3, 1))))
+    return short
 
 
 def _arc_length(poses: Floats, turn: float) -> Floats:

@@ -228,6 +228,21 @@ def test_one_photo_from_another_side_does_not_tilt_the_horizon(aside_rad: float)
     assert np.abs(tilt[has_horizon]).max() < 5.0
 
 
+def test_where_a_films_poses_break_off_the_path_jumps() -> None:
+    """A pan through 340 degrees, of which 100 have no poses."""
+    angles = np.radians(np.concatenate((np.arange(0, 120, 4), np.arange(220, 340, 4))))
+    eyes = np.stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(60, 1.5)], axis=-1)
+    poses = np.stack([look_at(eye, eye * [10, 10, 1]) for eye in eyes])
+    unseen = {}
+    for is_film in (True, False):
+        path = smooth_path(poses, 200, is_walk=True, is_film=is_film)
+        gaze = np.degrees(np.arctan2(-path[:, 1, 2], -path[:, 0, 2])) % 360.0
+        unseen[is_film] = int(((gaze > 125.0) & (gaze < 215.0)).sum())
+        turned = np.abs(np.diff(np.unwrap(np.radians(gaze))))
+        assert np.median(turned) < np.radians(2.0)
+    assert unseen[True] <= 2 < 30 < unseen[False]
+
+
 def test_the_horizon_of_pictures_on_their_side_stays_where_it_was() -> None:
     poses = ring(40)
     poses[:, :, :2] = poses[:, :, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
