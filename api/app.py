@@ -31,6 +31,7 @@ from storage.api_keys import ensure_api_key
 from storage.bell import Bell
 from storage.db import Database
 from storage.deletions import Drainer
+from storage.key_uses import KeyUses
 from storage.open_objects import open_object_store
 from storage.schema import upgrade
 
@@ -62,6 +63,7 @@ def open_services(settings: ApiSettings) -> Services:
         store,
         bell,
         Drainer(database, store),
+        KeyUses(database),
         (
             Probe("database", database.ping),
             Probe("broker", bell.ping),
@@ -77,6 +79,7 @@ def close_services(services: Services) -> None:
     """Close what `open_services` opened."""
     services.bell.close()
     services.drainer.close(DRAIN_S)
+    services.key_uses.close()
     services.database.dispose()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,20 +11,19 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from sqlalchemy.exc import OperationalError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from api.probes import Probe
 from api.problems import UnauthorizedError, UnavailableError
 from api.settings import ApiSettings
-from storage.api_keys import find_api_key, is_use_due, touch_api_key
+from storage.api_keys import find_api_key, is_use_due
 from storage.bell import Bell
 from storage.db import Database
 from storage.deletions import Drainer
+from storage.key_uses import KeyUses
 from storage.objects import ObjectStore
 
-logger = logging.getLogger("nerfworks.api")
 MAX_KEY_CHARS = 256
 MAX_STORE_CALLS = 8
 STORE_TURN_S = 1.0
@@ -43,6 +41,7 @@ class Services:
     store: ObjectStore
     bell: Bell
     drainer: Drainer
+    key_uses: KeyUses
     probes: tuple[Probe, ...]
     store_calls: threading.BoundedSemaphore
     """Held by a request that waits for the object store: a store that hangs stops only so many."""
@@ -134,14 +133,10 @@ def require_key(
         found = find_api_key(session, key)
     if found is None:
         raise UnauthorizedError("The API key is not valid.")
-    caller, due = Caller(found[0].id, found[0].tenant_id), is_use_due(*found)
-    if due:
-        try:
-            with services.database.session_scope() as session:
-                touch_api_key(session, caller.id)
-        except OperationalError as error:  # a full disk; who only reads need not fail for a note
-            logger.warning("the use of a key could not be noted: %s", error.orig)
-    return caller
+    record, moment = found
+    if is_use_due(record, moment):
+        services.key_uses.note(record.id)
+    return Caller(record.id, record.tenant_id)
 
 
 CallerDep = Annotated[Caller, Depends(require_key)]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection
 from datetime import datetime, timedelta
 
-from sqlalchemy import select
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from storage.db import first_and_now, now
@@ -14,7 +15,7 @@ from storage.models import ApiKey
 from storage.new_keys import new_api_key
 from storage.tenants import DEFAULT_TENANT
 
-_USED_GRAIN = timedelta(minutes=1)  # last_used_at moves no oftener: a read should rarely write
+USED_GRAIN = timedelta(minutes=1)  # last_used_at moves no oftener: a read should rarely write
 
 
 def _digest(key: str) -> str:
@@ -48,15 +49,19 @@ def find_api_key(session: Session, key: str) -> tuple[ApiKey, datetime] | None:
 
 
 def is_use_due(record: ApiKey, when: datetime) -> bool:
-    """Whether `touch_api_key` is worth a write."""
-    return record.last_used_at is None or when - record.last_used_at > _USED_GRAIN
+    """Whether `touch_api_keys` is worth a write."""
+    return record.last_used_at is None or when - record.last_used_at > USED_GRAIN
 
 
-def touch_api_key(session: Session, key_id: str) -> None:
-    """Note that a key was used."""
-    record = session.get(ApiKey, key_id)
-    if record is not None:
-        record.last_used_at = now(session)
+def touch_api_keys(session: Session, key_ids: Collection[str]) -> None:
+    """Note that keys were used. One that another transaction changes is passed over."""
+    free = (
+        select(ApiKey.id)
+        .where(ApiKey.id.in_(key_ids))
+        .with_for_update(skip_locked=True, key_share=True)
+    )
+    used = update(ApiKey).where(ApiKey.id.in_(free))
+    session.execute(used.values(last_used_at=now(session)))
 
 
 def revoke_api_key(session: Session, key_id: str) -> None:

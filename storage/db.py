@@ -51,8 +51,9 @@ ASK_AGAIN_MS = 10
 STATEMENT_S = 15.0
 POOL_S = 10.0
 ACTOR = "actor"
-_ENDED = ("25P03", "25P04")  # idle within a transaction, or in one, for too long
 """Key of `Session.info`: who changes something in this session. Events carry the name."""
+_ENDED = ("25P03", "25P04")  # idle within a transaction, or in one, for too long
+_PATIENCE = "nerfworks_patience_s"
 
 
 def clean_text(text: str, limit: int | None = None) -> str:
@@ -214,7 +215,8 @@ def _begin_writing(connection: Connection) -> None:
     SQLite itself asks ever more rarely the longer it waits, so that who came last goes first.
     """
     raw: Any = connection.connection.driver_connection
-    deadline = time.monotonic() + BUSY_TIMEOUT_S
+    patience_s = connection.get_execution_options().get(_PATIENCE, BUSY_TIMEOUT_S)
+    deadline = time.monotonic() + patience_s
     raw.execute(f"PRAGMA busy_timeout = {ASK_AGAIN_MS}")
     try:
         while time.monotonic() < deadline:
@@ -283,14 +285,22 @@ class Database:
 
     @contextmanager
     def session_scope(
-        self, actor: str | None = None, *, step: str | None = None
+        self,
+        actor: str | None = None,
+        *,
+        step: str | None = None,
+        patience_s: float | None = None,
     ) -> Iterator[Session]:
         """A session that may write. Commits when the block ends, rolls back when it raises.
 
         actor: who changes something, for the record. step: the operation in `storage.steps` that
-        this transaction is.
+        this transaction is. patience_s: how long those who write SQLite's file may keep this one
+        waiting, once in this process and once in others; None for BUSY_TIMEOUT_S.
         """
-        with self._turn(), self._write.begin() as session:
+        turn_s = BUSY_TIMEOUT_S if patience_s is None else patience_s
+        with self._turn(turn_s), self._write.begin() as session:
+            if patience_s is not None:
+                session.connection(execution_options={_PATIENCE: patience_s})
             self._narrow(session)
             if actor is not None:
                 name_actor(session, actor)
@@ -301,12 +311,12 @@ class Database:
             reached(f"{step}.committed")
 
     @contextmanager
-    def _turn(self) -> Iterator[None]:
+    def _turn(self, patience_s: float) -> Iterator[None]:
         """Around a session that may write. Raises OperationalError where others take too long."""
         with ExitStack() as held:
             if self._turns is not None:
                 try:
-                    held.enter_context(self._turns.one(BUSY_TIMEOUT_S))
+                    held.enter_context(self._turns.one(patience_s))
                 except TimeoutError as error:
                     raise OperationalError("BEGIN IMMEDIATE", {}, error) from error
             yield

@@ -196,7 +196,7 @@ def test_only_the_hash_of_a_key_is_kept_and_a_revoked_key_is_unknown(database: D
         mine, when = found
         assert abs(when - now(session)) < timedelta(seconds=30)
         assert api_keys.is_use_due(mine, when)
-        api_keys.touch_api_key(session, mine.id)
+        api_keys.touch_api_keys(session, [mine.id])
         session.flush()
         assert mine.last_used_at is not None
         assert not api_keys.is_use_due(mine, mine.last_used_at + timedelta(seconds=5))
