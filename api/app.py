@@ -27,7 +27,7 @@ from api.jobs import endpoints as jobs
 from api.probes import Probe
 from api.problems import Problem
 from api.settings import ApiSettings
-from storage.api_keys import ensure_api_key
+from storage.api_keys import take_bootstrap_key
 from storage.bell import Bell
 from storage.db import Database
 from storage.deletions import Drainer
@@ -44,13 +44,18 @@ logger = logging.getLogger("nerfworks.api")
 
 
 def open_services(settings: ApiSettings) -> Services:
-    """Open the parts: bring the database up to date, make the first key valid, tidy up."""
+    """Open the parts: bring the database up to date, take the key of the settings, tidy up."""
     upgrade(settings.resolved_database_url)
     database = Database(settings.resolved_database_url, settings.database_timeout_s)
     key = settings.bootstrap_key()
     if key:
         with database.session_scope() as session:
-            ensure_api_key(session, key, "bootstrap")
+            is_refused = take_bootstrap_key(session, key).revoked_at is not None
+        if is_refused:
+            logger.error(
+                "The API key of these settings was replaced or revoked before and stays invalid: "
+                "set the one that is valid, or one that was never used."
+            )
     settings.staging_dir.mkdir(parents=True, exist_ok=True)
     removed = sweep(settings.staging_dir)
     if removed:

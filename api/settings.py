@@ -42,7 +42,8 @@ class ApiSettings(StorageSettings):
         3.0, gt=0, le=60, description="How long /readyz waits for each part, in seconds."
     )
     bootstrap_api_key: SecretStr = Field(
-        SecretStr(""), description="A key that is made valid at the start; empty for none."
+        SecretStr(""),
+        description="A key that is made valid at the start, in place of the last; empty for none.",
     )
     bootstrap_api_key_file: Path | None = Field(
         None, description="A file that holds such a key (a mounted secret)."

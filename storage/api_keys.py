@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Collection
 from datetime import datetime, timedelta
 
-from sqlalchemy import select, update
+from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from storage.db import first_and_now, now
@@ -15,7 +16,12 @@ from storage.models import ApiKey
 from storage.new_keys import new_api_key
 from storage.tenants import DEFAULT_TENANT
 
+BOOTSTRAP = "bootstrap"
+"""Name of the keys that came from the service's settings, of which one is valid."""
+_LOCK = 0x6E65726B  # any number of our own: one start at a time on PostgreSQL
 USED_GRAIN = timedelta(minutes=1)  # last_used_at moves no oftener: a read should rarely write
+
+_log = logging.getLogger("nerfworks.storage")
 
 
 def _digest(key: str) -> str:
@@ -42,6 +48,37 @@ def ensure_api_key(
     return found
 
 
+def take_bootstrap_key(session: Session, key: str) -> ApiKey:
+    """Make the key of the settings valid in place of those that were so before.
+
+    A key that was replaced, or revoked, never becomes valid again: processes that still have it in
+    their settings change nothing, in whatever order they start. The record says whether it was
+    (`revoked_at`). Where several are valid, as earlier versions left them, the newest holds. What
+    was made with the others is their tenant's, and so the new one's.
+    """
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(select(func.pg_advisory_xact_lock(_LOCK)))
+    order = (ApiKey.created_at, ApiKey.id)
+    earlier = session.scalars(select(ApiKey).where(ApiKey.name == BOOTSTRAP).order_by(*order)).all()
+    valid = [record for record in earlier if record.revoked_at is None]
+    tenant_id = earlier[-1].tenant_id if earlier else DEFAULT_TENANT
+    found = ensure_api_key(session, key, BOOTSTRAP, tenant_id)
+    if found.revoked_at is not None:
+        return found
+    newest = valid[-1] if found in valid else found
+    newest.name = BOOTSTRAP
+    for record in valid:
+        if record is not newest:
+            record.revoked_at = now(session)
+            _log.warning("the API key %s of earlier settings is revoked", record.id)
+    return found
+
+
+def list_api_keys(session: Session) -> list[ApiKey]:
+    """All keys, the oldest first, with those that were revoked."""
+    return [*session.scalars(select(ApiKey).order_by(ApiKey.created_at, ApiKey.id))]
+
+
 def find_api_key(session: Session, key: str) -> tuple[ApiKey, datetime] | None:
     """The record of a key that is valid, and the time; None for one that is unknown or revoked."""
     query = select(ApiKey).where(ApiKey.sha256 == _digest(key), ApiKey.revoked_at.is_(None))
@@ -64,9 +101,10 @@ def touch_api_keys(session: Session, key_ids: Collection[str]) -> None:
     session.execute(used.values(last_used_at=now(session)))
 
 
-def revoke_api_key(session: Session, key_id: str) -> None:
-    """Make a key invalid. Raises NotFoundError."""
+def revoke_api_key(session: Session, key_id: str) -> ApiKey:
+    """Make a key invalid, for good. Raises NotFoundError."""
     record = session.get(ApiKey, key_id)
     if record is None:
         raise NotFoundError("API key", key_id)
     record.revoked_at = record.revoked_at or now(session)
+    return record
