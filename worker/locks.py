@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,15 +31,24 @@ def _try_lock(descriptor: int) -> bool:
 
 
 @contextmanager
-def folder_lock(root: Path, name: str, timeout_s: float, note: bytes = b"") -> Iterator[None]:
+def folder_lock(
+    root: Path,
+    name: str,
+    timeout_s: float,
+    note: bytes = b"",
+    guard: Callable[[], None] | None = None,
+) -> Iterator[None]:
     """Hold `root/.locks/name`. Raises FolderInUseError where another holds it for too long.
 
-    note: what others find there while the lock is held, see `read_holder`.
+    note: what others find there while the lock is held, see `read_holder`. guard: called again and
+    again while it waits; what it raises ends that.
     """
     descriptor = _open(root, name)
     try:
         deadline = time.monotonic() + timeout_s
         while not _try_lock(descriptor):
+            if guard is not None:
+                guard()
             if time.monotonic() > deadline:
                 raise FolderInUseError(f"{name} is in use by another process")
             time.sleep(_STEP_S)

@@ -57,6 +57,15 @@ class LeaseKeeper:
         self._stopped.set()
         self._thread.join()
 
+    def is_up_to_date(self) -> bool:
+        """Whether the last beat is younger than the lease.
+
+        Otherwise this process stood still, or the database is away: another may hold the stage, and
+        `lost` tells within a moment.
+        """
+        silent_s = time.monotonic() - self._beat_at
+        return silent_s <= self._settings.lease_s or not self._thread.is_alive()
+
     def report(
         self, fraction: float, message: str, eta_s: float | None, *, moved: bool = True
     ) -> None:
@@ -134,8 +143,8 @@ class LeaseKeeper:
                 self._progress = self._progress or progress
                 self._moved |= moved
             raise
-        self._beat_at = self._looked_at = moment
         if reply.lost:
             self.lost.set()
         if reply.cancel_requested:
             self.cancel_requested.set()
+        self._beat_at = self._looked_at = moment  # last: then `is_up_to_date`

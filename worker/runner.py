@@ -76,6 +76,7 @@ from worker.transfer import (
 
 _log = logging.getLogger("nerfworks.worker")
 MESSAGE_STEP_S = 0.25
+GUARD_STEP_S = 0.05
 LOG_END_S = 2.0
 CHECKPOINT_END_S = 120.0
 RECORD_STEP_S = 1.0
@@ -186,12 +187,16 @@ class Runner:
 
     def _guard_of(self, keeper: LeaseKeeper) -> Callable[[], None]:
         def guard() -> None:
-            if keeper.lost.is_set():
-                raise StopRunError("lost")
-            if keeper.cancel_requested.is_set():
-                raise StopRunError("cancel")
-            if self._shutdown.is_set():
-                raise StopRunError("shutdown")
+            while True:
+                if keeper.lost.is_set():
+                    raise StopRunError("lost")
+                if keeper.cancel_requested.is_set():
+                    raise StopRunError("cancel")
+                if self._shutdown.is_set():
+                    raise StopRunError("shutdown")
+                if keeper.is_up_to_date():
+                    return
+                time.sleep(GUARD_STEP_S)  # not a byte more before it is known whose the stage is
 
         return guard
 

@@ -1,6 +1,11 @@
 """Moves stage folders between a job's local folder and the object store.
 
-`guard` is called while bytes move; what it raises ends the transfer (a cancel, a lost lease).
+`guard` is called while bytes move, and before what lies here is replaced; what it raises ends the
+transfer (a cancel, a lost lease).
+
+What is fetched comes under a name of its own, is checked, and takes its place by a rename. The
+locks of those who fetch only spare two slots from bringing the same: nobody waits for one longer
+than FETCH_LOCK_S, as its holder may be a worker that stands still.
 """
 
 from __future__ import annotations
@@ -10,8 +15,10 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +28,10 @@ from storage.errors import ObjectStoreError, ObjectStoreFullError
 from storage.objects import ObjectStore
 from storage.queries import StageInput, StageWork
 from storage.steps import reached
-from worker.locks import folder_lock
+from worker.locks import FolderInUseError, folder_lock
 
 Guard = Callable[[], None]
-FETCH_LOCK_S = 3600.0
+FETCH_LOCK_S = 10.0
 ROOM_WAIT_S = 1800.0
 ROOM_STEP_S = 10.0
 
@@ -125,10 +132,13 @@ def download_folder(
     *,
     workers: int,
     expected: Sequence[Mapping[str, Any]] = (),
+    is_here: Callable[[], bool] = lambda: False,
 ) -> None:
     """Replace a folder by all objects below a prefix. It appears whole or not at all.
 
     expected: `{path, sha256}` of files that must be there. Raises ObjectStoreError for others.
+    is_here: asked at the end, whether another has brought the same meanwhile; then that one stays,
+    as somebody may be reading it.
     """
     temporary = folder.with_name(f".fetch-{folder.name}-{secrets.token_hex(4)}")
 
@@ -146,10 +156,26 @@ def download_folder(
             path = temporary / item["path"]
             if not path.is_file() or file_sha256(path) != item["sha256"]:
                 raise ObjectStoreError(f"{prefix}{item['path']} is missing or damaged.")
-        shutil.rmtree(folder, ignore_errors=True)
-        temporary.rename(folder)
+        guard()
+        if not is_here():
+            _replace(folder, temporary, is_here)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _replace(folder: Path, temporary: Path, is_here: Callable[[], bool]) -> None:
+    """Put a folder in another's place; the other goes in one step, before its files do."""
+    aside = temporary.with_name(f"{temporary.name}-old")
+    try:
+        with suppress(FileNotFoundError):
+            folder.rename(aside)
+        try:
+            temporary.rename(folder)
+        except OSError:  # another was faster
+            if not is_here():
+                raise
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _is_here(workspace: Workspace, wanted: StageInput) -> bool:
@@ -186,6 +212,16 @@ def missing_bytes(
     return int(needed)
 
 
+@contextmanager
+def _fetching(workspace: Workspace, name: str, guard: Guard) -> Iterator[None]:
+    """Wait a little for who else brings the same here; then go on, with the lock or without."""
+    with ExitStack() as held:
+        with suppress(FolderInUseError):
+            lock = folder_lock(workspace.root, f"fetch-{name}", FETCH_LOCK_S, guard=guard)
+            held.enter_context(lock)
+        yield
+
+
 def fetch_inputs(
     store: ObjectStore,
     workspace: Workspace,
@@ -198,9 +234,9 @@ def fetch_inputs(
     """Bring the folders that a stage reads; those that lie here with the same manifest stay."""
     for name in reads:
         wanted = work.inputs.get(name)
-        if wanted is None:
-            continue  # skipped: there is no folder
-        with folder_lock(workspace.root, f"fetch-{name}", FETCH_LOCK_S):
+        if wanted is None or _is_here(workspace, wanted):
+            continue  # skipped: there is no folder; or it was made here
+        with _fetching(workspace, name, guard):
             if not _is_here(workspace, wanted):
                 download_folder(
                     store,
@@ -209,6 +245,7 @@ def fetch_inputs(
                     guard,
                     workers=workers,
                     expected=wanted.manifest.get("files", []),
+                    is_here=partial(_is_here, workspace, wanted),
                 )
 
 
@@ -217,7 +254,9 @@ def fetch_capture(store: ObjectStore, workspace: Workspace, work: StageWork, gua
 
     Half of a capture would pass for one that is of no use, and the job would fail for good.
     """
-    with folder_lock(workspace.root, "fetch-capture", FETCH_LOCK_S):
+    if _is_capture_here(workspace, work):
+        return
+    with _fetching(workspace, "capture", guard):
         path = workspace.capture_file
         if _is_capture_here(workspace, work):
             return
@@ -257,6 +296,7 @@ def restore_checkpoint(
 
     What an earlier attempt left here is not trusted: it may have died while it wrote.
     """
+    guard()
     folder = workspace.checkpoint(stage)
     shutil.rmtree(folder, ignore_errors=True)
     for leftover in list(folder.parent.glob(f"{stage}.saved-*")):

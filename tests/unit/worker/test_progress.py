@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,9 +15,14 @@ from storage.db import Database
 from storage.jobs import request_cancel, stage_id
 from storage.leases import release_worker
 from storage.models import StageRow
+from storage.objects_local import LocalObjectStore
 from storage.records import read_logs
+from storage.settings import StorageSettings
 from tests.factories import make_database, make_job
+from worker.containment.planning import make_plan
+from worker.outcomes import StopRunError
 from worker.progress import LeaseKeeper
+from worker.runner import Runner
 from worker.settings import WorkerSettings
 
 SETTINGS = WorkerSettings(lease_s=3.0, heartbeat_s=0.5, cancel_poll_s=0.5)
@@ -104,3 +111,44 @@ def test_a_database_that_is_away_for_a_lease_means_the_lease_is_lost(
     with LeaseKeeper(away, claim, SETTINGS) as keeper:
         assert keeper.lost.wait(10)
     assert time.monotonic() - begun >= SETTINGS.lease_s
+
+
+def test_who_stood_still_for_a_lease_is_not_up_to_date_until_it_was_told(
+    database: Database, claim: Claim
+) -> None:
+    """As a process that goes on before its heartbeat does."""
+    with LeaseKeeper(database, claim, SETTINGS) as keeper:
+        assert keeper.is_up_to_date()
+        keeper._beat_at -= SETTINGS.lease_s + 1.0
+        assert not keeper.is_up_to_date()
+        wait(keeper.is_up_to_date)
+        assert not keeper.lost.is_set()
+        with database.session_scope() as session:
+            release_worker(session, "w")
+        keeper._beat_at -= SETTINGS.lease_s + 1.0
+        wait(keeper.is_up_to_date)
+        assert keeper.lost.is_set()
+
+
+def test_an_attempt_that_stood_still_goes_on_only_once_it_knows_whose_the_stage_is(
+    tmp_path: Path, database: Database, claim: Claim
+) -> None:
+    runner = Runner(
+        database,
+        LocalObjectStore(tmp_path / "objects", public_url="", signing_key=b""),
+        SETTINGS,
+        work_dir=tmp_path,
+        registry="tests.integration.toy_stages",
+        plan=make_plan(StorageSettings(home=tmp_path), SETTINGS, os.environ, has_gpu=False),
+        threads=lambda: 1,
+        shutdown=threading.Event(),
+    )
+    with LeaseKeeper(database, claim, SETTINGS) as keeper:
+        guard = runner._guard_of(keeper)
+        keeper._beat_at -= SETTINGS.lease_s + 1.0
+        guard()  # nobody took it
+        with database.session_scope() as session:
+            release_worker(session, "w")
+        keeper._beat_at -= SETTINGS.lease_s + 1.0
+        with pytest.raises(StopRunError, match="lost"):
+            guard()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ from storage.objects import OnBytes
 from storage.objects_local import LocalObjectStore
 from storage.queries import StageInput, StageWork
 from tests.factories import make_database, make_job
+from worker import transfer
 from worker.checkpoints import CheckpointUploader, Snapshot
+from worker.locks import folder_lock
 from worker.outcomes import crash_of, failure_of
 from worker.transfer import (
     download_folder,
@@ -189,6 +192,108 @@ def test_a_guard_ends_a_transfer_and_leaves_nothing(
     with pytest.raises(StopError):
         download_folder(store, "p/", tmp_path / "new", stop, workers=2)
     assert not [path for path in tmp_path.iterdir() if "new" in path.name]
+
+
+class LostError(Exception):
+    """What a guard raises."""
+
+
+def inputs_and_capture(store: LocalObjectStore, tmp_path: Path) -> StageWork:
+    folder, manifest = stage_folder(tmp_path / "made")
+    upload_folder(store, folder, "p/", no_guard, workers=1, step="publish")
+    store.path_of("c").mkdir(parents=True)
+    store.path_of("c/k").write_text("whole")
+    digest = hashlib.sha256(b"whole").hexdigest()
+    return replace(work_with(manifest), capture_key="c/k", capture_bytes=5, capture_sha256=digest)
+
+
+def fetch(
+    store: LocalObjectStore, workspace: Workspace, work: StageWork, guard: transfer.Guard
+) -> None:
+    fetch_capture(store, workspace, work, guard)
+    fetch_inputs(store, workspace, ("train",), work, guard, workers=1)
+
+
+def test_who_stands_still_while_it_fetches_holds_nobody_up(
+    store: LocalObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transfer, "FETCH_LOCK_S", 0.3)
+    work, workspace = inputs_and_capture(store, tmp_path), Workspace(tmp_path / "job")
+    with (
+        folder_lock(workspace.root, "fetch-capture", 0.0),
+        folder_lock(workspace.root, "fetch-train", 0.0),
+    ):
+        fetch(store, workspace, work, no_guard)
+        assert workspace.capture_file.read_text() == "whole"
+        assert (workspace.stage("train") / "deep" / "file.txt").read_text() == "result"
+        begun = time.monotonic()
+        fetch(store, workspace, work, no_guard)  # nobody is waited for where nothing is missing
+        assert time.monotonic() - begun < 0.3
+
+
+@pytest.mark.parametrize("held", ["fetch-capture", "fetch-train"])
+def test_who_waits_for_another_s_fetch_hears_a_cancel(
+    store: LocalObjectStore, tmp_path: Path, held: str
+) -> None:
+    work, workspace = inputs_and_capture(store, tmp_path), Workspace(tmp_path / "job")
+    begun = time.monotonic()
+
+    def guard() -> None:
+        if time.monotonic() > begun + 0.5:
+            raise LostError
+
+    with folder_lock(workspace.root, held, 0.0), pytest.raises(LostError):
+        fetch(store, workspace, work, guard)
+    assert time.monotonic() - begun < 3.0
+
+
+def test_the_later_of_two_who_bring_the_same_leaves_the_earlier_s_in_place(
+    store: LocalObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stage may be reading it."""
+    monkeypatch.setattr(transfer, "FETCH_LOCK_S", 0.2)
+    work, workspace = inputs_and_capture(store, tmp_path), Workspace(tmp_path / "job")
+    there: list[int] = []
+
+    class Slow(LocalObjectStore):
+        def get_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
+            super().get_file(key, path, on_bytes)
+            if not there:
+                fetch_inputs(store, workspace, ("train",), work, no_guard, workers=1)
+                there.append(workspace.stage("train").stat().st_ino)
+
+    slow = Slow(store.root, public_url="", signing_key=b"")
+    fetch_inputs(slow, workspace, ("train",), work, no_guard, workers=1)
+    assert workspace.stage("train").stat().st_ino == there[0]
+    assert {path.name for path in workspace.root.iterdir()} == {".locks", "train"}
+
+
+def test_who_has_lost_its_lease_replaces_nothing(store: LocalObjectStore, tmp_path: Path) -> None:
+    """The next holder's inputs and checkpoint lie there."""
+    work, workspace = inputs_and_capture(store, tmp_path), Workspace(tmp_path / "job")
+    stage_folder(workspace.root, "of a later generation")
+    fetched: list[str] = []
+
+    class Last(LocalObjectStore):
+        def get_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
+            super().get_file(key, path, on_bytes)
+            fetched.append(key)
+
+    def guard() -> None:
+        if len(fetched) == 2:
+            raise LostError
+
+    last = Last(store.root, public_url="", signing_key=b"")
+    with pytest.raises(LostError):
+        fetch_inputs(last, workspace, ("train",), work, guard, workers=1)
+    assert (workspace.stage("train") / "deep" / "file.txt").read_text() == "of a later generation"
+    kept = workspace.checkpoint("first") / "state"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("of who runs now")
+    with pytest.raises(LostError):
+        restore_checkpoint(store, workspace, "first", None, guard, workers=1)
+    assert kept.read_text() == "of who runs now"
+    assert {path.name for path in workspace.root.iterdir()} == {".checkpoint", ".locks", "train"}
 
 
 def claimed(tmp_path: Path) -> tuple[Any, Claim]:
