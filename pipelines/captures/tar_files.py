@@ -25,6 +25,13 @@ from typing import IO
 BLOCK_BYTES = 512
 _GZIP = b"\x1f\x8b\x08"
 _CHUNK_BYTES = 1 << 20
+_HEAD_BYTES = 256 << 10
+"""Of a gzipped file, where its first block must be: before it may come names, an extra field of
+64 KiB, and members with nothing in them."""
+_FIRST_PIECE_BYTES = 1 << 10
+_SHORT_MEMBERS = 1000
+"""How many members with less than a block of a tar in them a gzipped file may have in a row; longer
+ones make up for one of them a block. Each costs time, and no program packs less than a block."""
 _SMALL_BYTES = 4 << 20
 _MOST_GZIP_RATIO = 20.0
 """Unpacked to packed size of a gzipped tar: pictures hardly shrink at all, and what is unpacked
@@ -59,11 +66,15 @@ def is_tar(path: Path) -> bool:
     with path.open("rb") as file:
         block = file.read(BLOCK_BYTES)
         if is_gzip(block):
-            file.seek(0)
+            head, block = io.BytesIO(block + file.read(_HEAD_BYTES)), b""
             try:
-                block = next(_unpacked(file, BLOCK_BYTES), b"")
+                for chunk in _unpacked(head, BLOCK_BYTES, EOFError):
+                    block += chunk
+                    if len(block) >= BLOCK_BYTES:
+                        break
             except (EOFError, zlib.error):
                 return False
+            block = block[:BLOCK_BYTES]
     return is_header(block)
 
 
@@ -145,7 +156,7 @@ def _plain(path: Path, max_bytes: int, bomb: Bomb) -> IO[bytes]:
         file.seek(0)
         plain = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115
         try:
-            for chunk in _unpacked(file, _CHUNK_BYTES):
+            for chunk in _unpacked(file, _CHUNK_BYTES, bomb):
                 if plain.tell() + len(chunk) > most:
                     raise bomb(f"The archive unpacks to more than {most / 2**20:.0f} MiB.")
                 plain.write(chunk)
@@ -155,21 +166,33 @@ def _plain(path: Path, max_bytes: int, bomb: Bomb) -> IO[bytes]:
     return plain
 
 
-def _unpacked(file: IO[bytes], chunk_bytes: int) -> Iterator[bytes]:
+def _unpacked(file: IO[bytes], chunk_bytes: int, bomb: Bomb) -> Iterator[bytes]:
     """What gzip packed, in pieces. Not by `gzip`, which looks for the end of a name in a header one
-    byte at a time, however far away that is. Raises EOFError, zlib.error."""
-    packed = b""
+    byte at a time, however far away that is. Raises EOFError, zlib.error, and what `bomb` makes.
+
+    A member is fed in pieces that begin small: what it leaves of the last one is copied.
+    """
+    packed, place, spare = file.read(_CHUNK_BYTES), 0, _SHORT_MEMBERS
     while True:
         stream = zlib.decompressobj(wbits=31)
+        piece_bytes, num_bytes = _FIRST_PIECE_BYTES, 0
         while not stream.eof:
-            packed = packed or file.read(_CHUNK_BYTES)
-            if not packed:
+            if place == len(packed):
+                packed, place = file.read(_CHUNK_BYTES), 0
+            piece = packed[place : place + piece_bytes]
+            if not piece:
                 raise EOFError("cut off")
-            if chunk := stream.decompress(packed, chunk_bytes):
+            if chunk := stream.decompress(piece, chunk_bytes):
+                num_bytes += len(chunk)
                 yield chunk
-            packed = stream.unconsumed_tail
-        packed = stream.unused_data or file.read(_CHUNK_BYTES)
-        if not is_gzip(packed):  # the end, or what some programs fill up with
+            place += len(piece) - len(stream.unconsumed_tail) - len(stream.unused_data)
+            piece_bytes = min(2 * piece_bytes, _CHUNK_BYTES)
+        spare = min(spare + num_bytes // BLOCK_BYTES, _SHORT_MEMBERS) - 1
+        if spare < 0:
+            raise bomb("The archive is packed in many pieces with next to nothing in them.")
+        if len(packed) - place < len(_GZIP):
+            packed, place = packed[place:] + file.read(_CHUNK_BYTES), 0
+        if not packed.startswith(_GZIP, place):  # the end, or what some programs fill up with
             return
 
 

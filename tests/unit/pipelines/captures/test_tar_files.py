@@ -6,6 +6,7 @@ import gzip
 import io
 import os
 import random
+import struct
 import tarfile
 import tracemalloc
 import zlib
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.captures import tar_files
 from pipelines.captures.archive_rules import ArchiveLimits
 from pipelines.captures.sniff import sniff
 from pipelines.captures.unpack import CaptureArchive
@@ -141,6 +143,82 @@ def test_a_packed_tar_in_two_pieces_and_filled_up_is_read(tmp_path: Path) -> Non
     assert sniff(tmp_path / "c", "c").details["num_images"] == 4
 
 
+def member(data: bytes, name: bytes = b"", extra: bytes = b"") -> bytes:
+    """A member of a gzipped file, with the fields that its header may have."""
+    flags = (4 if extra else 0) | (8 if name else 0)
+    fields = (struct.pack("<H", len(extra)) + extra if extra else b"") + name + b"\0" * bool(name)
+    return b"\x1f\x8b\x08" + bytes([flags]) + bytes(6) + fields + gzip.compress(data)[10:]
+
+
+EMPTY = gzip.compress(b"")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda data: EMPTY + gzip.compress(data),
+        lambda data: member(b"", b"of nothing") + gzip.compress(data),
+        lambda data: member(data, b"a.tar"),
+        lambda data: member(data, extra=random.Random(1).randbytes(65_535)),
+        lambda data: gzip.compress(data[:100]) + gzip.compress(data[100:]),
+        lambda data: EMPTY.join(  # as bgzip ends its files, one behind another
+            member(data[n : n + 700], extra=b"BC\2\0\0\0") for n in range(0, len(data), 700)
+        ),
+        lambda data: EMPTY * 450 + gzip.compress(data) + EMPTY * 450,
+    ],
+    ids=["empty first", "empty, named", "named", "extra", "short first", "blocks", "many empty"],
+)
+def test_a_tar_packed_in_members_is_read(tmp_path: Path, make: Callable[[bytes], bytes]) -> None:
+    (tmp_path / "c").write_bytes(make(tarred(PHOTOS)))
+    assert sniff(tmp_path / "c", "c").details["num_images"] == 4
+
+
+@pytest.mark.parametrize("before", [0, 1, 2, 3])
+def test_a_member_may_begin_where_a_read_ends(tmp_path: Path, before: int) -> None:
+    data = tarred(PHOTOS)
+    first, second = gzip.compress(data[:3000]), gzip.compress(data[3000:])
+    left = (1 << 20) - before - len(first)
+    filling = member(b"", b"a" * (left - len(EMPTY) - 1))
+    assert len(first + filling) == (1 << 20) - before
+    packed = first + filling + second
+    (tmp_path / "c").write_bytes(packed)
+    assert sniff(tmp_path / "c", "c").details["num_images"] == 4
+
+
+def test_what_many_members_cost_grows_with_the_file_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each that ends leaves the rest of what it was fed to be copied."""
+    fed = 0
+
+    class Counting:
+        def __init__(self, wbits: int) -> None:
+            self._stream = zlib.decompressobj(wbits=wbits)
+
+        def decompress(self, data: bytes, most: int) -> bytes:
+            nonlocal fed
+            fed += len(data)
+            return self._stream.decompress(data, most)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._stream, name)
+
+    class Zlib:
+        error, decompressobj = zlib.error, Counting
+
+    path = tmp_path / "c"
+    data = tarred({**PHOTOS, "5.jpg": random.Random(2).randbytes(1 << 20)})
+    path.write_bytes(b"".join(gzip.compress(data[n : n + 512]) for n in range(0, len(data), 512)))
+    monkeypatch.setattr(tar_files, "zlib", Zlib)
+    with CaptureArchive(path, LIMITS) as archive:
+        assert len(archive.names) == 5
+    assert fed < 4 * path.stat().st_size
+    fed = 0
+    path.write_bytes(EMPTY * 500_000)
+    assert not tar_files.is_tar(path)
+    assert fed < 2 << 20
+
+
 LINKS = (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.FIFOTYPE)
 HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     **{
@@ -249,6 +327,19 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "no pictures": (lambda: tarred({"a.txt": b"words"}), "no_images"),
     "packed, but no tar": (lambda: gzip.compress(picture()), "unknown_type"),
     "empty, packed": (lambda: gzip.compress(b""), "unknown_type"),
+    "empty, packed again and again": (lambda: EMPTY * 50_000, "unknown_type"),
+    "packed, then nothing, packed again and again": (
+        lambda: gzip.compress(tarred(PHOTOS)) + EMPTY * 50_000,
+        "archive_bomb",
+    ),
+    "packed in many pieces of a few bytes": (
+        lambda: b"".join(
+            gzip.compress(data[n : n + 40])
+            for data in [tarred({**PHOTOS, "5.jpg": random.Random(3).randbytes(50_000)})]
+            for n in range(0, len(data), 40)
+        ),
+        "archive_bomb",
+    ),
 }
 
 
