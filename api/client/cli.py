@@ -15,8 +15,8 @@
 With --json a command prints one JSON document on the standard output, and all else on the standard
 error output.
 
-Exit status: 0 done, 1 the job failed, the call was refused, or the capture is unusable, 2 wrong
-usage, 3 no service reached.
+Exit status: 0 done, 1 the job failed, the call was refused, the capture is unusable, or there is
+nothing to download, 2 wrong usage, 3 no service reached.
 Ctrl-C while watching leaves the job running.
 """
 
@@ -232,6 +232,11 @@ def download(client: Client, args: argparse.Namespace, console: Console) -> int:
     """Download what a job offers."""
     job_id = _job_of(client, args)
     folder = Path("out") / job_id if args.folder is None else Path(args.folder)
+    if not client.artifacts(job_id):
+        job = client.get_job(job_id)
+        do = f"nerfworks {'retry' if job.is_over else 'watch'} {job_id}"
+        do = f"Run it again: {do}" if job.is_over else f"See it: {do}"
+        raise NerfworksError(f"Job {job_id} is {job.state}: there is nothing to download.", do)
     for path in _download(client, job_id, folder, console):
         console.print(clean(str(path)), highlight=False, soft_wrap=True)
     return OK

@@ -48,10 +48,12 @@ from api.client.wire import (
     Wire,
     checked,
     find_service,
+    is_busy,
     once_header,
     poll_pause,
     problem_of,
     segment,
+    timeout_until,
 )
 
 __all__ = [
@@ -247,22 +249,35 @@ class Client:
         """Wait until a job is over; restarts of the service are ridden out.
 
         on_update: called with the job each time it was looked at. check: raise JobFailed where it
-        did not succeed. Raises WaitTimedOut after `timeout` seconds.
+        did not succeed. Raises WaitTimedOut after `timeout` seconds, also where no answer came.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
+        path, job = f"/v1/jobs/{segment(job_id)}", None
+
+        def look() -> httpx.Response:
+            return self._wire.http.get(path, timeout=timeout_until(deadline))
+
+        def is_late() -> bool:
+            return deadline is not None and time.monotonic() >= deadline
+
         while True:
-            answer = checked(
-                self._wire.send(lambda: self._wire.http.get(f"/v1/jobs/{segment(job_id)}"))
-            )
-            job = Job.model_validate(answer.json())
+            try:
+                answer = self._wire.send(look, deadline)
+            except ConnectionFailed as error:
+                if is_late():
+                    raise WaitTimedOut(job_id, job, timeout or 0.0) from error
+                raise
+            if is_busy(answer) and is_late():
+                raise WaitTimedOut(job_id, job, timeout or 0.0)
+            job = Job.model_validate(checked(answer).json())
             if on_update is not None:
                 on_update(job)
             if job.is_over:
                 if check and job.state != "succeeded":
                     raise JobFailed(job)
                 return job
-            if deadline is not None and time.monotonic() >= deadline:
-                raise WaitTimedOut(job, timeout or 0.0)
+            if is_late():
+                raise WaitTimedOut(job_id, job, timeout or 0.0)
             pause = poll_pause(answer)
             if deadline is not None:
                 pause = min(pause, max(deadline - time.monotonic(), 0.0))

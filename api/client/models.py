@@ -225,15 +225,21 @@ class JobFailed(NerfworksError):
 
 
 class WaitTimedOut(NerfworksError):
-    """A job is not over yet; it goes on."""
+    """A job is not over yet; it goes on. job: as it was last seen; None where no answer came."""
 
-    def __init__(self, job: Job, timeout_s: float) -> None:
+    def __init__(self, job_id: str, job: Job | None, timeout_s: float) -> None:
+        self.job = job
+        if job is None:
+            super().__init__(
+                f"The service said nothing of job {job_id} within {timeout_s:.0f} s.",
+                "The job goes on; wait again.",
+            )
+            return
         stages = [f"{s.name} at {s.progress:.0%}" for s in job.stages if s.state == "running"]
         at = f" ({', '.join(stages)})" if stages else ""
         super().__init__(
             f"Job {job.id} is {job.state}{at} after {timeout_s:.0f} s.", "It goes on; wait again."
         )
-        self.job = job
 
 
 class ChecksumMismatch(NerfworksError):

@@ -18,7 +18,10 @@ from api.client.models import ApiProblem, ConnectionFailed
 
 POLL_MIN_S, POLL_MAX_S = 0.2, 30.0
 PAUSE_FIRST_S, PAUSE_MOST_S = 0.2, 5.0
-TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+TIMEOUT_S, CONNECT_TIMEOUT_S = 60.0, 5.0
+TIMEOUT = httpx.Timeout(TIMEOUT_S, connect=CONNECT_TIMEOUT_S)
+LOOK_S = 1.0
+"""What a request has at least, however little time is left."""
 BUSY = frozenset({502, 503, 504})
 RUNNING = "idempotency_key_running"
 _START = "Start one with `make up`, or set NERFWORKS_URL and NERFWORKS_API_KEY."
@@ -64,13 +67,16 @@ class Wire:
         """A successful GET. Raises ApiProblem, ConnectionFailed."""
         return checked(self.send(lambda: self.http.get(path, params=params)))
 
-    def send(self, request: Callable[[], httpx.Response]) -> httpx.Response:
+    def send(
+        self, request: Callable[[], httpx.Response], until: float | None = None
+    ) -> httpx.Response:
         """Send until there is an answer. What creates something carries an Idempotency-Key, so that
         sending it again never makes a second one.
 
-        Raises ConnectionFailed where there is none for `retry_s` seconds after the first failure.
+        Raises ConnectionFailed where there is none for `retry_s` seconds after the first failure,
+        or at the moment `until` of `time.monotonic`.
         """
-        patience = Patience(self.retry_s)
+        patience = Patience(self.retry_s, until)
         while True:
             try:
                 answer = request()
@@ -99,8 +105,10 @@ class Patience:
     It counts from the first failure: an upload may take much longer than a service is away.
     """
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, until: float | None = None) -> None:
+        """until: a moment of `time.monotonic` at which the time is up in any case."""
         self._seconds = seconds
+        self._until = until
         self._deadline: float | None = None
         self._pause_s = PAUSE_FIRST_S
 
@@ -109,6 +117,8 @@ class Patience:
         moment = time.monotonic()
         if self._deadline is None:
             self._deadline = moment + self._seconds
+            if self._until is not None:
+                self._deadline = min(self._deadline, self._until)
         left_s = self._deadline - moment
         if left_s <= 0.0:
             return False
@@ -120,6 +130,14 @@ class Patience:
         """The same; raises ConnectionFailed where the time is up."""
         if not self.pause():
             raise unreachable(url, error) from error
+
+
+def timeout_until(until: float | None) -> httpx.Timeout:
+    """How long a request may wait that should be over at a moment of `time.monotonic`."""
+    if until is None:
+        return TIMEOUT
+    left_s = max(until - time.monotonic(), LOOK_S)
+    return httpx.Timeout(min(left_s, TIMEOUT_S), connect=min(left_s, CONNECT_TIMEOUT_S))
 
 
 def unreachable(url: str, error: Exception) -> ConnectionFailed:

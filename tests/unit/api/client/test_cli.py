@@ -294,6 +294,27 @@ def test_download_goes_to_a_folder_of_the_job(
     assert (tmp_path / "out" / job / "video.mp4").read_bytes() == b"x"
 
 
+def test_download_of_a_job_that_offers_nothing_says_how_it_stands(
+    command: LiveServer,
+    archive: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cli.main(["submit", str(archive)])
+    job = newest(command)
+    for state, hint in (("queued", f"nerfworks watch {job}"), ("cancelled", f"retry {job}")):
+        capsys.readouterr()
+        assert cli.main(["download"]) == 1
+        said = capsys.readouterr()
+        assert f"Job {job} is {state}: there is nothing to download." in said.err
+        assert hint in said.err
+        assert not said.out
+        assert not (tmp_path / "out").exists()
+        cli.main(["cancel", job])
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from api.client.client import (
@@ -20,6 +22,7 @@ from api.client.client import (
     ChecksumMismatch,
     Client,
     ConnectionFailed,
+    Job,
     JobFailed,
     NerfworksError,
     WaitTimedOut,
@@ -130,6 +133,35 @@ def test_wait_returns_the_job_once_it_is_over(
     done = client.wait(job.id, on_update=lambda job: states.append(job.state), timeout=30)
     assert done.state == states[-1] == "succeeded"
     assert len(done.artifacts) == NUM_ARTIFACTS
+
+
+@pytest.mark.parametrize("hangs", [True, False], ids=["hangs", "away"])
+def test_a_wait_is_over_on_time_though_no_answer_comes(hangs: bool) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        port = mute.getsockname()[1] if hangs else free_port()
+        begun = time.monotonic()
+        with Client(f"http://127.0.0.1:{port}", KEY) as client, pytest.raises(WaitTimedOut) as late:
+            client.wait("some-job", timeout=1.0)
+    assert 1.0 <= time.monotonic() - begun < 10.0
+    assert late.value.job is None
+    assert "some-job" in late.value.message
+    assert isinstance(late.value.__cause__, ConnectionFailed)
+
+
+def test_a_wait_whose_service_falls_silent_says_how_the_job_stood(
+    client: Client, archive: Path
+) -> None:
+    job = client.create_job(client.upload(archive).id)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        away = f"http://127.0.0.1:{mute.getsockname()[1]}"
+
+        def fall_silent(_: Job) -> None:
+            client._wire.http.base_url = httpx.URL(away)
+
+        with pytest.raises(WaitTimedOut) as late:
+            client.wait(job.id, on_update=fall_silent, timeout=2.0)
+    assert late.value.job is not None
+    assert late.value.job.state == "queued"
 
 
 def test_wait_raises_for_a_job_that_did_not_succeed_where_asked(
