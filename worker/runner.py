@@ -185,7 +185,9 @@ class Runner:
         reached("finish.tidied")
         return ready
 
-    def _guard_of(self, keeper: LeaseKeeper) -> Callable[[], None]:
+    def _guard_of(self, keeper: LeaseKeeper, *, waits: bool) -> Callable[[], None]:
+        """waits: not a byte more before it is known whose the stage is."""
+
         def guard() -> None:
             while True:
                 if keeper.lost.is_set():
@@ -194,14 +196,14 @@ class Runner:
                     raise StopRunError("cancel")
                 if self._shutdown.is_set():
                     raise StopRunError("shutdown")
-                if keeper.is_up_to_date():
+                if not waits or keeper.is_up_to_date():
                     return
-                time.sleep(GUARD_STEP_S)  # not a byte more before it is known whose the stage is
+                time.sleep(GUARD_STEP_S)
 
         return guard
 
     def _attempt(self, claim: Claim, keeper: LeaseKeeper, prefix: str) -> dict[str, Any]:
-        guard, workers = self._guard_of(keeper), self._settings.transfers
+        guard, workers = self._guard_of(keeper, waits=True), self._settings.transfers
         laps, self._peak_bytes = Laps(), None
         stage = self._registry.get_stage(claim.name)
         with self._database.read_scope() as session:
@@ -346,7 +348,7 @@ class Runner:
         pulse: Pulse,
     ) -> dict[str, Any]:
         """Take the process's messages until the stage has ended, or must."""
-        guard = self._guard_of(keeper)
+        guard = self._guard_of(keeper, waits=False)
         deadline = time.monotonic() + stage.time_limit_s
         while True:
             try:

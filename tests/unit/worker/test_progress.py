@@ -144,7 +144,7 @@ def test_an_attempt_that_stood_still_goes_on_only_once_it_knows_whose_the_stage_
         shutdown=threading.Event(),
     )
     with LeaseKeeper(database, claim, SETTINGS) as keeper:
-        guard = runner._guard_of(keeper)
+        guard = runner._guard_of(keeper, waits=True)
         keeper._beat_at -= SETTINGS.lease_s + 1.0
         guard()  # nobody took it
         with database.session_scope() as session:
