@@ -37,6 +37,7 @@ from storage.transitions import (
     drop_waiting,
     lock_job,
     record_event,
+    restore,
     set_job,
     set_stage,
     settle,
@@ -53,11 +54,10 @@ _UNTRIED: dict[str, Any] = {
     "started_at": None,
     "finished_at": None,
     "error": None,
-    "output_prefix": None,
-    "summary": None,
-    "manifest": None,
-    "fingerprint": None,
+    "report_prefix": None,
+    "report_files": None,
 }
+"""Of a stage that is done again. What its last success published it keeps until the next."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,8 @@ def ready_stage_ids(job: Job) -> list[str]:
 def request_cancel(session: Session, job_id: str, when: datetime | None = None) -> Job:
     """Ask a job to stop; a second request, or one for a finished job, changes nothing.
 
-    The job is `cancelled` at once where no stage runs, else `cancelling` until it has stopped.
+    The job is `cancelled` at once where no stage runs, else `cancelling` until it has stopped. What
+    a retry was to make anew is then as it was before it.
     """
     job, stages = lock_job(session, job_id)
     when = when or now(session)
@@ -185,6 +186,7 @@ def request_cancel(session: Session, job_id: str, when: datetime | None = None) 
         running = any(row.state == "running" for row in stages)
         state = "cancelling" if running else "cancelled"
         set_job(session, job, state, when, cancel_requested_at=when)
+        settle(session, job, stages, when)
     return job
 
 
@@ -236,21 +238,25 @@ def retry_job(
     for the record. What the other stages published stays and is used; so does the checkpoint of a
     stage that had not succeeded, which decides itself whether it fits its options. Behind a stage
     that is done again no checkpoint is kept: it was begun on inputs that are no more. What a stage
-    that is done again had published stays in the store until it has succeeded anew.
+    that is done again had published stays its own until it has succeeded anew: where that does not
+    happen it is its result again (`storage.transitions.put_back`). So it is of a stage that ended
+    badly and is not done again.
     """
     when = when or now(session)
     stages = list(job.stages)
     moved = _with_other_inputs(stages, redo)
     for row in stages:
-        if row.name not in redo:
+        gone, kept = [row.report_prefix], row.checkpoint_prefix
+        if row.name in redo:
+            if row.name in moved:
+                gone, kept = [*gone, kept], None
+            values = {**_UNTRIED, "checkpoint_prefix": kept}
+            set_stage(session, row, "blocked", when, reason="retry", **values)
+        elif row.state in ("failed", "cancelled") and row.output_prefix is not None:
+            restore(session, row, when)
+        else:
             continue
-        gone = [row.output_prefix] if row.state == "failed" else []
-        kept = row.checkpoint_prefix
-        if row.name in moved:
-            gone, kept = [*gone, kept], None
         session.add_all(PendingDeletion(prefix=old, created_at=when) for old in gone if old)
-        values = {**_UNTRIED, "checkpoint_prefix": kept}
-        set_stage(session, row, "blocked", when, reason="retry", **values)
     record = {"generation": job.generation + 1, "from_stage": from_stage, "options": changes}
     set_job(
         session,

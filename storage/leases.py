@@ -61,7 +61,7 @@ class FailureReport:
 
     def values(self) -> dict[str, Any]:
         """Columns of the stage's row."""
-        return {"output_prefix": self.prefix, "manifest": {"files": self.files}}
+        return {"report_prefix": self.prefix, "report_files": self.files}
 
 
 @dataclass(frozen=True)

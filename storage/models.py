@@ -158,6 +158,8 @@ class StageRow(Tenanted, Base):
     not_before: when a retry may start. ready_at: since when it could run. rung_at: when the bell
     last rang for it. progress_at: when it last got on. manifest: what `manifest.json` holds.
     fingerprint: all that its result depends on, as one number; a retry asks whether it is the same.
+    These, output_prefix and summary are those of its last success, also while it is done again
+    (`storage.results`). report_prefix, report_files: what it published of its failure.
     """
 
     __tablename__ = "stages"
@@ -193,6 +195,8 @@ class StageRow(Tenanted, Base):
     )
     fingerprint: Mapped[str | None] = mapped_column(CleanText(64))
     checkpoint_prefix: Mapped[str | None] = mapped_column(String(255))
+    report_prefix: Mapped[str | None] = mapped_column(String(255))
+    report_files: Mapped[list[dict[str, Any]] | None] = mapped_column(CleanJson(none_as_null=True))
 
     __table_args__ = (
         Index(None, "state", "lease_until"),

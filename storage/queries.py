@@ -18,6 +18,7 @@ from storage.db import now
 from storage.errors import InvalidCursorError, NotFoundError
 from storage.models import Capture, Event, Job, StageRow, is_id
 from storage.queue import RESOURCES
+from storage.results import fitting
 from storage.runs import has_ended
 from storage.states import JOB_STATES
 from storage.tenants import OF_ALL
@@ -40,7 +41,7 @@ class StageInput:
 class StageWork:
     """All that running a claimed stage takes.
 
-    inputs: the published stages, by name; of an export those of the job that it is of.
+    inputs: the published stages that go together, by name; of an export those of its job.
     ran_out_of_memory: whether an earlier attempt did.
     """
 
@@ -192,8 +193,8 @@ def stage_work(session: Session, claim: Claim) -> StageWork:
         options=job.options.get(claim.name, {}),
         inputs={
             row.name: StageInput(row.name, row.output_prefix, row.manifest)
-            for row in made
-            if row.state == "succeeded" and row.output_prefix and row.manifest
+            for row in fitting(made).values()
+            if row.output_prefix and row.manifest
         },
         checkpoint_prefix=own.checkpoint_prefix,
         is_export=job.parent is not None,

@@ -88,8 +88,8 @@ def _spoken_for(session: Session, prefixes: list[str]) -> set[str]:
         .join(Job, Job.id == StageRow.job_id)
         .where(Job.id.in_({root.split("/")[-2] for root in roots}), Job.object_root.in_(roots))
     ).all()
-    named |= {row.output_prefix for row, _ in found if row.output_prefix}
-    named |= {row.checkpoint_prefix for row, _ in found if row.checkpoint_prefix}
+    for row, _ in found:
+        named |= {row.output_prefix or "", row.checkpoint_prefix or "", row.report_prefix or ""}
     running = {(root, row.name, row.lease_token) for row, root in found if row.state == "running"}
     named |= {
         prefix

@@ -134,6 +134,23 @@ def run_of(session: Session, job_id: str, stage: str, token: int) -> StageRun | 
     return session.scalar(query, execution_options={"populate_existing": True})
 
 
+def maker_of(session: Session, row: StageRow) -> StageRun | None:
+    """The claim that published what the stage's row names."""
+    query = select(StageRun).where(
+        StageRun.job_id == row.job_id,
+        StageRun.stage == row.name,
+        StageRun.outcome == "succeeded",
+        StageRun.output_prefix == row.output_prefix,
+    )
+    return session.scalar(query.order_by(StageRun.id.desc()).limit(1))
+
+
+def options_of(session: Session, run: StageRun) -> dict[str, Any] | None:
+    """What the stage of a claim was run with; None where nobody knows."""
+    made = session.get(JobGeneration, (run.job_id, run.generation))
+    return None if made is None else made.options.get(run.stage)
+
+
 def count_ends(session: Session, row: StageRow, outcome: str) -> int:
     """How often the stage ended so since it last got on, its present claim counted as one more.
 

@@ -9,12 +9,14 @@ old state in the UPDATE itself and is checked against these tables.
             (create)     |         |-> cancelled
                  blocked, ready -> cancelled        the job was cancelled, or failed elsewhere
         succeeded, failed, cancelled -> blocked     the job is retried, and this stage with it
+                 failed, cancelled -> succeeded     with what it had made before
                  skipped                            given at creation: no use for it in this job
 
     job:    queued -> running -> succeeded | failed
             queued -> cancelled
             running -> cancelling -> cancelled      (at once where no stage is running)
             succeeded, failed, cancelled -> queued  retried: a new generation
+            queued -> succeeded                     retried, and every result holds
 """
 
 from __future__ import annotations
@@ -27,14 +29,14 @@ STAGE_TRANSITIONS: MappingProxyType[str, frozenset[str]] = MappingProxyType(
         "ready": frozenset({"running", "cancelled"}),
         "running": frozenset({"ready", "succeeded", "failed", "cancelled"}),
         "succeeded": frozenset({"blocked"}),
-        "failed": frozenset({"blocked"}),
-        "cancelled": frozenset({"blocked"}),
+        "failed": frozenset({"blocked", "succeeded"}),
+        "cancelled": frozenset({"blocked", "succeeded"}),
         "skipped": frozenset(),
     }
 )
 JOB_TRANSITIONS: MappingProxyType[str, frozenset[str]] = MappingProxyType(
     {
-        "queued": frozenset({"running", "cancelled"}),
+        "queued": frozenset({"running", "cancelled", "succeeded"}),
         "running": frozenset({"succeeded", "failed", "cancelling", "cancelled"}),
         "cancelling": frozenset({"cancelled"}),
         "succeeded": frozenset({"queued"}),

@@ -19,7 +19,8 @@ from sqlalchemy.orm import Session
 from storage.db import ACTOR
 from storage.errors import ConflictError, LostLeaseError, NotFoundError
 from storage.models import Event, Job, StageRow
-from storage.runs import RunEnd, end_run
+from storage.results import fitting
+from storage.runs import RunEnd, end_run, maker_of, options_of
 from storage.states import JOB_TERMINAL, STAGE_DONE, check_transition
 
 
@@ -154,12 +155,13 @@ def _is_done(name: str, by_name: dict[str, StageRow]) -> bool:
 
 
 def settle(session: Session, job: Job, stages: list[StageRow], when: datetime) -> list[str]:
-    """Draw the consequences for the job: unblock, succeed, finish a cancel. Ids newly ready."""
-    if job.state == "cancelling":
+    """Draw the consequences for the job: unblock, succeed, finish a cancel, put back what a retry
+    left undone. Ids newly ready."""
+    if job.state == "cancelling" or job.state in JOB_TERMINAL:
         if not any(row.state == "running" for row in stages):
-            set_job(session, job, "cancelled", when)
-        return []
-    if job.state in JOB_TERMINAL:
+            if job.state == "cancelling":
+                set_job(session, job, "cancelled", when)
+            put_back(session, job, stages, when)
         return []
     by_name = {row.name: row for row in stages}
     ready = [
@@ -169,9 +171,43 @@ def settle(session: Session, job: Job, stages: list[StageRow], when: datetime) -
     ]
     for row in ready:
         set_stage(session, row, "ready", when)
-    if job.state == "running" and all(row.state in STAGE_DONE for row in stages):
+    if all(row.state in STAGE_DONE for row in stages):
         set_job(session, job, "succeeded", when)
     return [row.id for row in ready]
+
+
+def put_back(session: Session, job: Job, stages: list[StageRow], when: datetime) -> None:
+    """Of a job that is over: stages that a retry left undone have again what they had made before.
+
+    But not where what that was made of is no more (`storage.results`). A failed stage stays failed,
+    and a failed job keeps the options that it was to be run with; one that was cancelled gets those
+    that its results were made with.
+    """
+    undone = [row for row in stages if row.state == "cancelled" and row.output_prefix is not None]
+    if not undone:
+        return
+    fit = fitting(stages)
+    options = dict(job.options)
+    for row in undone:
+        if row.name not in fit:
+            continue
+        made_with = restore(session, row, when)
+        if job.state == "cancelled" and made_with is not None:
+            options[row.name] = made_with
+    if options != job.options:
+        job.options = options
+
+
+def restore(session: Session, row: StageRow, when: datetime) -> dict[str, Any] | None:
+    """Make what a stage had made before its result again. The options that it was made with."""
+    run = maker_of(session, row)
+    values: dict[str, Any] = {"progress": 1.0, "message": "", "error": None, "not_before": None}
+    if run is not None:
+        values |= {"attempt": run.attempt, "started_at": run.started_at}
+        values |= {"finished_at": run.finished_at, "progress_at": run.finished_at}
+    values |= {"report_prefix": None, "report_files": None}
+    set_stage(session, row, "succeeded", when, reason="earlier_result", **values)
+    return None if run is None else options_of(session, run)
 
 
 def drop_waiting(

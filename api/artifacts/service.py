@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
@@ -13,8 +13,9 @@ from api.deps import Services
 from api.problems import MissingError
 from pipelines.registry import STAGES, get_stage
 from pipelines.stage import CAPTURE_PAGE, CAPTURE_REPORT, REPORT, Artifact
-from storage.models import Job
+from storage.models import Job, StageRow
 from storage.objects_local import LocalObjectStore
+from storage.results import is_offered
 
 _OF_FAILURES = {
     found.path: found
@@ -37,30 +38,37 @@ class Published:
 
 
 def published(job: Job) -> Iterator[Published]:
-    """The artifacts of the job's succeeded stages; of a job that failed, its reports, too.
+    """What the job's stages have made; of a job that failed, its reports, too.
 
-    The job is loaded with its manifests.
+    Of a stage that a retry did not make anew, what it had made before; but what went wrong is said
+    by the report of the failure alone. The job is loaded with its manifests.
     """
     rows = {row.name: row for row in job.stages}
+    reports = {found.artifact.path: found for found in _of_failure(job, rows)}
     there: set[str] = set()
     for stage in STAGES:
         row = rows.get(stage.name)
-        if row is None or row.state != "succeeded" or not row.output_prefix or not row.manifest:
+        if row is None or not is_offered(row) or not row.output_prefix or not row.manifest:
             continue
         files = {entry["path"]: entry for entry in row.manifest["files"]}
         for artifact in stage.artifacts:
             entry = files.get(artifact.path)
-            if entry is not None:
+            if entry is not None and not (artifact.path == REPORT and REPORT in reports):
                 key = row.output_prefix + artifact.path
                 there.add(artifact.name)
                 yield Published(artifact, key, entry["bytes"], entry["sha256"])
+    yield from (found for found in reports.values() if found.artifact.name not in there)
+
+
+def _of_failure(job: Job, rows: Mapping[str, StageRow]) -> Iterator[Published]:
     failed = rows.get(str((job.error or {}).get("stage")))
-    if failed is not None and failed.state == "failed" and failed.output_prefix:
-        for entry in (failed.manifest or {}).get("files", []):
-            known = _OF_FAILURES.get(entry["path"])
-            if known is not None and known.name not in there:
-                key = failed.output_prefix + known.path
-                yield Published(known, key, entry["bytes"], entry["sha256"])
+    if failed is None or not failed.report_prefix:
+        return
+    for entry in failed.report_files or []:
+        known = _OF_FAILURES.get(entry["path"])
+        if known is not None:
+            key = failed.report_prefix + known.path
+            yield Published(known, key, entry["bytes"], entry["sha256"])
 
 
 def find(job: Job, name: str) -> Published:

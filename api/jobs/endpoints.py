@@ -138,7 +138,9 @@ async def retry_job(
 ) -> Response:
     """Run a job that is over again, from what failed or from where options change its results.
 
-    What still holds is used as it is: same stage version, options, inputs and seed.
+    What still holds is used as it is: same stage version, options, inputs and seed. Where the retry
+    is cancelled, or fails, what was not made anew is offered as before; a cancel also brings back
+    the options that it was made with.
     """
     wanted = wanted or RetryRequest()
     call = f"POST /v1/jobs/{job_id}/retry"

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from api.problems import ConflictedError
 from storage.models import Job
+from storage.results import fitting
 
 TRAINING = "train"
 _WHY_NOT: Mapping[str, str] = {
@@ -16,16 +17,19 @@ _WHY_NOT: Mapping[str, str] = {
 
 
 def check_exportable(job: Job) -> None:
-    """Raise ConflictedError (not_trained) where a job has no trained scene to export."""
+    """Raise ConflictedError (not_trained) where a job has no trained scene to export.
+
+    One that a retry was to train anew, and did not, counts with what it was trained on.
+    """
     if job.parent_id is not None:
         raise ConflictedError(
             f"Job {job.id} is itself an export.",
             code="not_trained",
             hint=f"Ask for exports of the job that it is of, {job.parent_id}.",
         )
-    state = next((row.state for row in job.stages if row.name == TRAINING), "skipped")
-    if state == "succeeded":
+    if TRAINING in fitting(job.stages):
         return
+    state = next((row.state for row in job.stages if row.name == TRAINING), "skipped")
     why = _WHY_NOT.get(state, "its training has not ended yet")
     hint = "Wait until its stage train has succeeded."
     if state in _WHY_NOT:

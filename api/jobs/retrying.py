@@ -18,12 +18,13 @@ from pipelines.registry import STAGE_NAMES, get_stage
 from storage import jobs
 from storage.exports import live_exports
 from storage.models import Job, StageRow
+from storage.results import is_offered
 
 
 def _holds(row: StageRow, rows: Mapping[str, StageRow], options: dict[str, Any], seed: int) -> bool:
     """Whether a stage would make what it has made: same version, options, inputs and seed."""
     made = row.manifest
-    if row.state != "succeeded" or made is None or row.name not in STAGE_NAMES:
+    if not is_offered(row) or made is None or row.name not in STAGE_NAMES:
         return False
     if row.fingerprint is None or "inputs" not in made:
         return False
@@ -42,19 +43,22 @@ def stages_to_redo(
 ) -> list[str]:
     """The stages whose results do not hold with these options, in order, and all behind them.
 
-    from_stage: one that is run again in any case. An export reads what its job has made.
+    from_stage: one that is run again in any case. So is what failed, unless other options than it
+    failed with are those of what it had made before. An export reads what its job has made.
     """
     rows = {row.name: row for row in (*(job.parent.stages if job.parent else ()), *job.stages)}
     behind: set[str] = set()  # what is run again, and skipped stages that only pass it on
     redo = []
     for row in job.stages:
         waits = not behind.isdisjoint(row.after)
+        wanted = options.get(row.name, {})
         if row.state == "skipped":
             behind |= {row.name} if waits else set()
         elif (
             waits
             or row.name == from_stage
-            or not _holds(row, rows, options.get(row.name, {}), job.seed)
+            or (row.state == "failed" and wanted == job.options.get(row.name, {}))
+            or not _holds(row, rows, wanted, job.seed)
         ):
             behind.add(row.name)
             redo.append(row.name)
@@ -106,6 +110,7 @@ def _check_nobody_reads(session: Session, job: Job, redo: list[str]) -> None:
 def retry(session: Session, job_id: str, wanted: RetryRequest) -> list[str]:
     """Put a job that is over into the queue again. Ids of the stages that can start.
 
+    One that did not succeed, and whose every result holds all the same, has succeeded thereby.
     Raises NotFoundError, ConflictError (it is not over), ConflictedError (nothing is to be done),
     MissingError (the capture is gone and needed), InvalidRequestError, OptionsError.
     """
@@ -119,7 +124,7 @@ def retry(session: Session, job_id: str, wanted: RetryRequest) -> list[str]:
             errors=[FieldProblem(path="from_stage", detail="a stage that the job has")],
         )
     redo = stages_to_redo(job, options, from_stage)
-    if not redo:
+    if not redo and job.state == "succeeded":
         raise ConflictedError(
             "Every result of the job holds: there is nothing to do again.",
             code="nothing_to_retry",

@@ -143,16 +143,21 @@ def wrong_objects(
         job = jobs.get(row.job_id)
         if job is not None and row.checkpoint_prefix:
             kept.add(row.checkpoint_prefix)  # of a stage that was cut short: a retry goes on there
-        if job is None or not row.output_prefix or not row.manifest:
+        if job is None:
             continue
-        is_result = row.state == "succeeded"
+        for entry in row.report_files or []:
+            key = f"{row.report_prefix}{entry['path']}"
+            named.add(key)
+            wrong += _differs(store, key, entry["sha256"])
+        if not row.output_prefix or not row.manifest:
+            continue
         files = {entry["path"]: entry["sha256"] for entry in row.manifest["files"]}
         for path, sha256 in files.items():
             named.add(row.output_prefix + path)
             wrong += _differs(store, row.output_prefix + path, sha256)
-        if not is_result:
-            continue
         named.add(row.output_prefix + MANIFEST)
+        if row.state != "succeeded":
+            continue  # a retry was to make it anew, and did not
         place = attempt_prefix(job.object_root, row.name, row.attempt, row.lease_token)
         if row.output_prefix != place:
             wrong.append(f"{row.id} was published as {row.output_prefix}")

@@ -23,14 +23,21 @@ def check_published(database: Database, store: LocalObjectStore, job: str) -> No
     """What the stages of a job made is in the store as their manifests have it, and nothing else
     lies beside it; each stage succeeded once, in one claim."""
     with database.read_scope() as session:
-        query = select(StageRow).where(StageRow.job_id == job, StageRow.output_prefix.is_not(None))
-        rows = session.scalars(query).all()
-        made = {row.name: (row.output_prefix, row.manifest, row.state) for row in rows}
+        rows = session.scalars(select(StageRow).where(StageRow.job_id == job)).all()
+        made = {
+            row.name: (row.output_prefix, row.manifest["files"], row.state)
+            for row in rows
+            if row.output_prefix and row.manifest
+        } | {
+            row.name: (row.report_prefix, row.report_files, row.state)
+            for row in rows
+            if row.report_prefix
+        }
         runs = list_runs(session, job)
-    for prefix, manifest, state in made.values():
+    for prefix, files, state in made.values():
         assert prefix is not None
-        assert manifest is not None
-        wanted = {item["path"]: item["sha256"] for item in manifest["files"]}
+        assert files is not None
+        wanted = {item["path"]: item["sha256"] for item in files}
         there = {
             key.removeprefix(prefix): hashlib.sha256(b"".join(store.read(key))).hexdigest()
             for key in store.list(prefix)
@@ -56,7 +63,11 @@ def check_only_what_is_named(database: Database, store: LocalObjectStore) -> Non
         blobs = session.execute(select(Blob.object_key, Blob.refs)).all()
         assert captures == {row.object_key: row.refs for row in blobs}
         named = {*captures}
-        prefixes = {row.output_prefix for row in rows} | {row.checkpoint_prefix for row in rows}
+        prefixes = {
+            prefix
+            for row in rows
+            for prefix in (row.output_prefix, row.checkpoint_prefix, row.report_prefix)
+        }
         notes = session.scalar(select(func.count()).select_from(PendingDeletion))
         open_claims = session.scalars(
             select(StageRun.stage).where(StageRun.outcome.is_(None))

@@ -75,7 +75,7 @@ def test_an_error_of_the_input_fails_the_job_at_once_with_its_code(engine: Engin
     assert {row.name: row.state for row in job.stages}["train"] == "cancelled"
     assert len(engine.notes("frames start")) == 1
     failed = engine.stage(job.id, "frames")
-    report = json.loads(b"".join(engine.store.read(f"{failed.output_prefix}report.json")))
+    report = json.loads(b"".join(engine.store.read(f"{failed.report_prefix}report.json")))
     assert report["state"] == "failed"
     assert (report["error"]["stage"], report["error"]["code"]) == ("frames", "no_images")
     assert report["failed_report"] == {"said": "The plan says no."}
@@ -175,10 +175,10 @@ def test_a_stage_that_crashes_each_time_fails_the_job(engine: Engine) -> None:
     assert job.error["code"] == "worker_lost"
     assert len(engine.notes("train start")) == 3
     train = engine.stage(job_id, "train")
-    report = json.loads(b"".join(engine.store.read(f"{train.output_prefix}report.json")))
+    report = json.loads(b"".join(engine.store.read(f"{train.report_prefix}report.json")))
     assert (report["error"]["code"], report["failed_report"]) == ("worker_lost", None)
     kept = list(engine.store.list(stage_prefix(root_of(job_id), "train")))
-    assert kept == [f"{train.output_prefix}report.json"], "those of the first two crashes are gone"
+    assert kept == [f"{train.report_prefix}report.json"], "those of the first two crashes are gone"
 
 
 def test_a_killed_worker_takes_its_stage_process_along_and_its_next_self_resumes(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,7 +10,9 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from alembic import command
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.migration import MigrationContext
 
 from storage.claims import Claim, claim_next
@@ -19,7 +22,7 @@ from storage.models import Base, Capture, Job, PendingDeletion
 from storage.queries import get_job, list_events
 from storage.records import delete_capture, read_logs
 from storage.runs import list_generations, list_runs
-from storage.schema import upgrade
+from storage.schema import _MIGRATIONS, upgrade
 from tests.factories import make_capture
 
 
@@ -287,6 +290,58 @@ def test_what_ran_before_fingerprints_were_kept_gets_its_own(
             whose = set(session.scalars(sa.text(f"SELECT tenant_id FROM {name}")))
             assert whose == {"default"}, name
     database.dispose()
+
+
+@pytest.mark.parametrize("kind", ["sqlite", pytest.param("pg", marks=pytest.mark.services)])
+def test_reports_of_failures_move_to_a_place_of_their_own_and_back(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    url = f"sqlite:///{tmp_path / 'a.db'}"
+    if kind == "pg":
+        url = request.getfixturevalue("postgres_url")
+    fill(url, "0001", FIRST)
+    upgrade(url, "0006")
+    engine = make_engine(url)
+    files = [{"path": "report.json", "bytes": 2, "sha256": "0" * 64}]
+    failed = f"{'a' * 28}-first"
+    with engine.begin() as connection:
+        connection.execute(
+            sa.text(
+                "UPDATE stages SET state = 'failed', output_prefix = 'report/', "
+                "manifest = :manifest WHERE id = :id"
+            ),
+            {"id": failed, "manifest": json.dumps({"files": files})},
+        )
+    upgrade(url)
+    database = Database(url)
+    with database.session_scope() as session:
+        rows = {row.id: row for row in get_job(session, "a" * 28, manifests=True).stages}
+        row = rows[failed]
+        assert (row.report_prefix, row.report_files) == ("report/", files)
+        assert (row.output_prefix, row.manifest) == (None, None)
+        past = rows[f"{'a' * 28}-past"]
+        assert (past.manifest, past.report_prefix) == ({"fingerprint": "9" * 64}, None)
+        row.output_prefix, row.fingerprint = "kept/", "8"  # as of a retry that failed
+    database.dispose()
+    downgrade(url, "0006")
+    with engine.connect() as connection:
+        query = "SELECT id, output_prefix, manifest, fingerprint FROM stages WHERE job_id LIKE 'a%'"
+        found = {row.id: row for row in connection.execute(sa.text(query))}
+    manifest = found[failed].manifest
+    assert (found[failed].output_prefix, found[failed].fingerprint) == ("report/", None)
+    assert (json.loads(manifest) if isinstance(manifest, str) else manifest) == {"files": files}
+    assert found[f"{'a' * 28}-past"].fingerprint == "9" * 64
+    engine.dispose()
+
+
+def downgrade(url: str, revision: str) -> None:
+    """Bring the schema back to a revision."""
+    engine, config = make_engine(url), Config()
+    config.set_main_option("script_location", str(_MIGRATIONS))
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.downgrade(config, revision)
+    engine.dispose()
 
 
 def test_whatever_belongs_to_somebody_says_to_whom() -> None:

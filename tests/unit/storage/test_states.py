@@ -186,8 +186,8 @@ class AnyOrder(RuleBasedStateMachine):
                     return
                 redo = {first, *behind.get(first, set())}
                 redo |= {row.name for row in job.stages if row.state != "succeeded"}
-                if "first" in redo:
-                    redo |= {stage.name for stage in DIAMOND}
+                for name in [*redo]:
+                    redo |= behind.get(name, set())
                 before = job.generation
                 ready = retry_job(session, job, redo, job.options, changes={}, when=self.when)
                 assert ready
