@@ -7,6 +7,7 @@ import signal
 from typing import Any
 
 from pipelines.errors import PipelineError, ResourceError
+from storage.damage import CAPTURE, INPUT_DAMAGED
 from storage.errors import ObjectMissingError, ObjectStoreError, ObjectStoreFullError
 from worker.locks import FolderInUseError
 
@@ -41,6 +42,19 @@ class StageCrashedError(Exception):
         self.cause = cause
         self.error = error
         self.exit_code = exit_code
+
+
+class InputDamagedError(ObjectStoreError):
+    """What a stage reads is missing from the object store, or is not what is on record.
+
+    name: the stage that made it, or CAPTURE. of_parent: whether that is a stage of the job that an
+    export is of.
+    """
+
+    def __init__(self, name: str, reason: str, *, of_parent: bool = False) -> None:
+        super().__init__(reason)
+        self.name = name
+        self.of_parent = of_parent
 
 
 def _out_of_memory(stage: str) -> dict[str, Any]:
@@ -145,6 +159,25 @@ def folder_in_use(stage: str) -> dict[str, Any]:
     ).as_dict()
 
 
+def _input_damaged(stage: str, error: InputDamagedError) -> dict[str, Any]:
+    """Trying again can help: another machine may still have the files."""
+    if error.name == CAPTURE:
+        what = "The capture"
+        hint = "Upload the same file again, which replaces what is stored; then retry the job."
+    elif error.of_parent:
+        what = f"What {error.name} made"
+        hint = f"Retry the export's job from the stage {error.name}; then retry the export."
+    else:
+        what, hint = f"What {error.name} made", f"Retry the job, which runs {error.name} again."
+    return PipelineError(
+        f"{what} is missing or damaged in the object store, and {stage} needs it.",
+        code=INPUT_DAMAGED,
+        hint=hint,
+        retryable=True,
+        details={"input": error.name},
+    ).as_dict()
+
+
 def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
     """What an exception in the worker around the stage means, as an error of the stage."""
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -156,11 +189,14 @@ def failure_of(stage: str, error: BaseException) -> dict[str, Any]:
         ).as_dict()
     if isinstance(error, FolderInUseError):
         return folder_in_use(stage)
+    if isinstance(error, InputDamagedError):
+        return _input_damaged(stage, error)
     if isinstance(error, ObjectMissingError):
         return PipelineError(
             f"A file that {stage} needs is no longer stored.",
             code="input_missing",
-            hint="Upload the capture again and submit a new job.",
+            hint="Retry the job.",
+            retryable=True,
         ).as_dict()
     if isinstance(error, ObjectStoreError):
         return ResourceError(

@@ -24,11 +24,13 @@ from typing import Any
 
 from pipelines.manifest import file_sha256
 from pipelines.workspace import MANIFEST, Workspace
-from storage.errors import ObjectStoreError, ObjectStoreFullError
+from storage.damage import CAPTURE
+from storage.errors import ObjectMissingError, ObjectStoreFullError
 from storage.objects import ObjectStore
 from storage.queries import StageInput, StageWork
 from storage.steps import reached
 from worker.locks import FolderInUseError, folder_lock
+from worker.outcomes import InputDamagedError
 
 Guard = Callable[[], None]
 FETCH_LOCK_S = 10.0
@@ -136,7 +138,7 @@ def download_folder(
 ) -> None:
     """Replace a folder by all objects below a prefix. It appears whole or not at all.
 
-    expected: `{path, sha256}` of files that must be there. Raises ObjectStoreError for others.
+    expected: `{path, sha256}` of files that must be there. Raises ObjectMissingError for others.
     is_here: asked at the end, whether another has brought the same meanwhile; then that one stays,
     as somebody may be reading it.
     """
@@ -155,7 +157,7 @@ def download_folder(
         for item in expected:
             path = temporary / item["path"]
             if not path.is_file() or file_sha256(path) != item["sha256"]:
-                raise ObjectStoreError(f"{prefix}{item['path']} is missing or damaged.")
+                raise ObjectMissingError(f"{prefix}{item['path']} is missing or damaged.")
         guard()
         if not is_here():
             _replace(folder, temporary, is_here)
@@ -222,6 +224,15 @@ def _fetching(workspace: Workspace, name: str, guard: Guard) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def _blaming(name: str, *, of_parent: bool = False) -> Iterator[None]:
+    """Say of what is not in the store as it was put there whose it is (`InputDamagedError`)."""
+    try:
+        yield
+    except ObjectMissingError as error:
+        raise InputDamagedError(name, str(error), of_parent=of_parent) from error
+
+
 def fetch_inputs(
     store: ObjectStore,
     workspace: Workspace,
@@ -231,13 +242,18 @@ def fetch_inputs(
     *,
     workers: int,
 ) -> None:
-    """Bring the folders that a stage reads; those that lie here with the same manifest stay."""
+    """Bring the folders that a stage reads; those that lie here with the same manifest stay.
+
+    Raises InputDamagedError where one does not come as it was published.
+    """
     for name in reads:
         wanted = work.inputs.get(name)
         if wanted is None or _is_here(workspace, wanted):
             continue  # skipped: there is no folder; or it was made here
         with _fetching(workspace, name, guard):
-            if not _is_here(workspace, wanted):
+            if _is_here(workspace, wanted):
+                continue
+            with _blaming(name, of_parent=work.is_export):
                 download_folder(
                     store,
                     wanted.prefix,
@@ -247,10 +263,12 @@ def fetch_inputs(
                     expected=wanted.manifest.get("files", []),
                     is_here=partial(_is_here, workspace, wanted),
                 )
+                if not _is_here(workspace, wanted):
+                    raise ObjectMissingError(f"{wanted.prefix}{MANIFEST} is missing or damaged.")
 
 
 def fetch_capture(store: ObjectStore, workspace: Workspace, work: StageWork, guard: Guard) -> None:
-    """Bring the uploaded bytes. Raises ObjectStoreError where others come.
+    """Bring the uploaded bytes. Raises InputDamagedError where others come, or none.
 
     Half of a capture would pass for one that is of no use, and the job would fail for good.
     """
@@ -263,9 +281,10 @@ def fetch_capture(store: ObjectStore, workspace: Workspace, work: StageWork, gua
         temporary = path.with_name(f".fetch-{secrets.token_hex(4)}")
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            store.get_file(work.capture_key, temporary, lambda count: guard())
-            if file_sha256(temporary) != work.capture_sha256:
-                raise ObjectStoreError(f"{work.capture_key} is damaged.")
+            with _blaming(CAPTURE):
+                store.get_file(work.capture_key, temporary, lambda count: guard())
+                if file_sha256(temporary) != work.capture_sha256:
+                    raise ObjectMissingError(f"{work.capture_key} is damaged.")
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)

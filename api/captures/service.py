@@ -16,7 +16,8 @@ from api.idempotency import Done, Once, do_once
 from pipelines.captures.sniff import Sniffed, sniff
 from storage import records
 from storage.blobs import find_blob
-from storage.errors import BlobMissingError, ObjectStoreError
+from storage.damage import is_found_damaged
+from storage.errors import BlobMissingError, ObjectMissingError, ObjectStoreError
 from storage.keys import blob_content
 from storage.models import new_id
 from storage.steps import reached
@@ -25,20 +26,29 @@ from storage.steps import reached
 def keep(services: Services, received: Received, once: Once) -> Response:
     """Look at a received file, store its bytes, then record it, once. Returns the answer.
 
-    Bytes that are here already are not stored again (`storage.blobs`). Raises CaptureError for a
-    file that is of no use.
+    Bytes that are here already are not stored again (`storage.blobs`), unless the store has lost
+    or damaged them. Raises CaptureError for a file that is of no use.
     """
     sniffed = sniff(received.path, received.filename)
     tenant_id = once.caller.tenant_id
     with services.database.read_scope() as session:
         found = find_blob(session, tenant_id, received.sha256)
+        is_damaged = found is not None and is_found_damaged(session, found.id)
     upload = _Upload(services, received, sniffed, tenant_id, once)
     if found is not None:
         with contextlib.suppress(BlobMissingError):  # it went since: these are needed after all
-            if not services.store.exists(found.object_key):
-                services.store.put_file(found.object_key, received.path)  # it had been lost
+            if is_damaged or not _lies_there(services, found.object_key, received.bytes):
+                services.store.put_file(found.object_key, received.path)
             return upload.record(brought=None)[0].response
     return _store_and_record(upload)
+
+
+def _lies_there(services: Services, key: str, num_bytes: int) -> bool:
+    """Whether the object is there, as long as it must be."""
+    try:
+        return services.store.stat(key).bytes == num_bytes
+    except ObjectMissingError:
+        return False
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from pipelines.options import OptionsError, revise_options
 from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, get_stage
 from storage import jobs
+from storage.damage import damaged_input
 from storage.exports import live_exports
 from storage.models import Job, StageRow
 from storage.results import is_offered
@@ -43,9 +44,11 @@ def stages_to_redo(
 ) -> list[str]:
     """The stages whose results do not hold with these options, in order, and all behind them.
 
-    from_stage: one that is run again in any case. So is what failed, unless other options than it
-    failed with are those of what it had made before. An export reads what its job has made.
+    from_stage: one that is run again in any case. So is one whose files a later stage found damaged
+    in the object store; and what failed, unless other options than it failed with are those of what
+    it had made before. An export reads what its job has made.
     """
+    damaged = {damaged_input(row.error) for row in job.stages}
     rows = {row.name: row for row in (*(job.parent.stages if job.parent else ()), *job.stages)}
     behind: set[str] = set()  # what is run again, and skipped stages that only pass it on
     redo = []
@@ -57,6 +60,7 @@ def stages_to_redo(
         elif (
             waits
             or row.name == from_stage
+            or row.name in damaged
             or (row.state == "failed" and wanted == job.options.get(row.name, {}))
             or not _holds(row, rows, wanted, job.seed)
         ):

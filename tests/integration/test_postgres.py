@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -12,10 +12,11 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from storage.claims import claim_stage
+from storage.damage import is_found_damaged
 from storage.db import Database, now
 from storage.errors import NotFoundError
 from storage.jobs import StageSeed, create_job, delete_job, request_cancel, stage_id
-from storage.leases import cancel_stage, reap_expired, succeed_stage
+from storage.leases import cancel_stage, fail_stage, reap_expired, succeed_stage
 from storage.models import LogLine
 from storage.queries import get_job, list_jobs
 from storage.records import append_logs, delete_capture, get_capture, read_logs
@@ -24,6 +25,7 @@ from tests.integration.engine import Engine
 from tests.services import RedisServer, S3Endpoint
 
 pytestmark = pytest.mark.services
+HOUR = timedelta(hours=1)
 
 
 def test_one_of_many_claims_at_once_wins(database: Database) -> None:
@@ -98,6 +100,22 @@ def test_pages_and_deletion(database: Database) -> None:
     with database.session_scope() as session:
         delete_job(session, ids[0])
         assert len(list_jobs(session)[0]) == 4
+
+
+def test_bytes_that_a_stage_found_damaged_are_known(database: Database) -> None:
+    with database.session_scope() as session:
+        capture = make_capture(session)
+        blob, job = str(capture.blob_id), make_job(session, capture=capture).id
+    for name in ("ingest", "capture"):
+        error = {"code": "input_damaged", "message": "", "hint": "", "details": {"input": name}}
+        with database.session_scope() as session:
+            assert not is_found_damaged(session, blob)
+            claim = claim_stage(session, stage_id(job, "first"), "w", 60.0)
+            assert claim is not None
+            fail_stage(session, claim, error, retryable=True, when=now(session) - HOUR)
+    with database.read_scope() as session:
+        assert is_found_damaged(session, blob)
+        assert not is_found_damaged(session, job)
 
 
 def test_no_job_is_made_on_a_capture_that_was_just_deleted(database: Database) -> None:

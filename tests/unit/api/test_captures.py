@@ -32,6 +32,7 @@ from api.captures.receiving import (
 )
 from api.problems import ApiError
 from storage.models import Capture
+from storage.objects import ObjectStat
 from storage.objects_local import LocalObjectStore
 from tests.unit.api.conftest import (
     KEY,
@@ -119,11 +120,14 @@ def test_the_same_file_twice_is_stored_once_and_goes_with_the_last_capture(
     assert len(service.objects()) == 1
 
 
-def test_bytes_that_the_store_lost_come_back_with_the_next_upload(service: Service) -> None:
+@pytest.mark.parametrize("left", [None, b"", b"half"])
+def test_bytes_that_the_store_lost_come_back_with_the_next_upload(
+    service: Service, left: bytes | None
+) -> None:
     content = zip_of_pictures()
     service.upload(content)
     (lost,) = service.objects()
-    lost.unlink()
+    lost.unlink() if left is None else lost.write_bytes(left)
     service.upload(content)
     assert service.objects() == [lost]
     assert lost.read_bytes() == content
@@ -135,14 +139,14 @@ def test_an_upload_whose_twin_is_deleted_meanwhile_is_stored_all_the_same(
     """Found when the upload begins to be kept, gone when it is recorded."""
     content = zip_of_pictures()
     twin = service.upload(content)
-    look = LocalObjectStore.exists
+    look = LocalObjectStore.stat
 
-    def look_and_delete(store: LocalObjectStore, key: str) -> bool:
+    def look_and_delete(store: LocalObjectStore, key: str) -> ObjectStat:
         found = look(store, key)
         assert service.http.delete(f"/v1/captures/{twin['id']}").status_code == 204
         return found
 
-    monkeypatch.setattr(LocalObjectStore, "exists", look_and_delete)
+    monkeypatch.setattr(LocalObjectStore, "stat", look_and_delete)
     service.upload(content)
     (kept,) = service.objects()
     assert kept.read_bytes() == content

@@ -11,11 +11,13 @@ from pipelines.options import OptionsError, resolve_options, revise_options
 from pipelines.presets import PRESETS
 from pipelines.registry import STAGES
 from storage.claims import claim_stage
+from storage.damage import CAPTURE
 from storage.jobs import stage_id
 from storage.keys import stage_prefix
 from storage.leases import fail_stage
 from tests.factories import root_of
 from tests.unit.api.conftest import LEASE_S, Service, finish_job, run_stage
+from worker.outcomes import InputDamagedError, failure_of
 
 ERROR = {"code": "tool_failed", "message": "It broke.", "hint": "Mend it."}
 RETRIED = ("job.queued", "retry")
@@ -62,6 +64,32 @@ def test_a_failed_job_goes_on_from_what_failed(service: Service) -> None:
     assert [stage["attempt"] for stage in found["stages"] if stage["name"] == "poses"] == [0]
     run_stage(service.services, job, "poses", {"b": b"b"})
     assert states(service.http.get(f"/v1/jobs/{job}").json())["depth"] == "ready"
+
+
+@pytest.mark.parametrize(
+    ("name", "redone"), [("ingest", {"ingest", "poses"}), (CAPTURE, {"poses"})]
+)
+def test_what_a_stage_found_damaged_is_made_again(
+    service: Service, name: str, redone: set[str]
+) -> None:
+    job = service.job(preset="preview")["id"]
+    run_stage(service.services, job, "ingest", {"a": b"a"})
+    error = failure_of("poses", InputDamagedError(name, "a is missing"))
+    with service.services.database.session_scope() as session:
+        claim = claim_stage(session, stage_id(job, "poses"), "test", LEASE_S)
+        assert claim is not None
+        fail_stage(session, claim, error, retryable=False)
+    told = service.http.get(f"/v1/jobs/{job}").json()["error"]
+    assert (told["code"], told["details"]) == ("input_damaged", {"input": name})
+    found = retry(service, job)
+    assert again(found) >= redone
+    assert ("ingest" in again(found)) == ("ingest" in redone)
+    service.http.post(f"/v1/jobs/{job}/cancel")
+    assert again(retry(service, job)) >= redone, "it was not made yet"
+    if name == "ingest":
+        run_stage(service.services, job, "ingest", {"a": b"a"})
+        service.http.post(f"/v1/jobs/{job}/cancel")
+        assert "ingest" not in again(retry(service, job)), "it was made anew"
 
 
 def test_a_cancelled_job_can_be_taken_up_again(service: Service) -> None:

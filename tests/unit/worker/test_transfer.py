@@ -24,7 +24,7 @@ from tests.factories import make_database, make_job
 from worker import transfer
 from worker.checkpoints import CheckpointUploader, Snapshot
 from worker.locks import folder_lock
-from worker.outcomes import crash_of, failure_of
+from worker.outcomes import InputDamagedError, crash_of, failure_of
 from worker.transfer import (
     download_folder,
     fetch_capture,
@@ -125,18 +125,64 @@ def test_a_damaged_input_is_not_accepted(store: LocalObjectStore, tmp_path: Path
     assert not workspace.stage("train").exists()
 
 
-@pytest.mark.parametrize("came", ["wholf", "who"])
+@pytest.mark.parametrize("file", ["deep/file.txt", "manifest.json"])
+@pytest.mark.parametrize("left", [None, "re", "RESULT"])
+@pytest.mark.parametrize("is_export", [False, True])
+def test_a_damaged_input_is_told_by_the_name_of_who_made_it(
+    store: LocalObjectStore, tmp_path: Path, file: str, left: str | None, is_export: bool
+) -> None:
+    folder, manifest = stage_folder(tmp_path)
+    upload_folder(store, folder, "p/", no_guard, workers=2, step="publish")
+    stored = store.path_of(f"p/{file}")
+    stored.unlink() if left is None else stored.write_text(left)
+    workspace = Workspace(tmp_path / "job")
+    workspace.root.mkdir()
+    work = replace(work_with(manifest), is_export=is_export)
+    with pytest.raises(InputDamagedError) as found:
+        fetch_inputs(store, workspace, ("train",), work, no_guard, workers=2)
+    told = failure_of("mesh", found.value)
+    assert (told["code"], told["details"]) == ("input_damaged", {"input": "train"})
+    assert "train" in told["hint"]
+    assert ("export" in told["hint"]) == is_export
+    upload_folder(store, folder, "p/", no_guard, workers=2, step="publish")
+    fetch_inputs(store, workspace, ("train",), work, no_guard, workers=2)
+
+
+def test_a_store_that_does_not_answer_damages_nothing(tmp_path: Path) -> None:
+    class Away(LocalObjectStore):
+        def get_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
+            raise ObjectStoreError("timed out")
+
+    store = Away(tmp_path / "objects", public_url="", signing_key=b"")
+    folder, manifest = stage_folder(tmp_path)
+    upload_folder(store, folder, "p/", no_guard, workers=2, step="publish")
+    workspace, work = Workspace(tmp_path / "job"), work_with(manifest)
+    workspace.root.mkdir()
+    for fetch in (
+        lambda: fetch_inputs(store, workspace, ("train",), work, no_guard, workers=2),
+        lambda: fetch_capture(store, workspace, replace(work, capture_bytes=5), no_guard),
+    ):
+        with pytest.raises(ObjectStoreError) as found:
+            fetch()
+        assert failure_of("mesh", found.value)["code"] == "object_store_unavailable"
+
+
+@pytest.mark.parametrize("came", ["wholf", "who", None])
 def test_a_damaged_capture_is_not_accepted(
-    store: LocalObjectStore, tmp_path: Path, came: str
+    store: LocalObjectStore, tmp_path: Path, came: str | None
 ) -> None:
     """It would pass for one that is of no use, and the job would fail for good."""
     workspace = Workspace(tmp_path / "job")
     digest = hashlib.sha256(b"whole").hexdigest()
     work = replace(work_with({}), capture_key="c/k", capture_bytes=5, capture_sha256=digest)
     store.path_of("c").mkdir(parents=True)
-    store.path_of("c/k").write_text(came)
-    with pytest.raises(ObjectStoreError, match="damaged"):
+    if came is not None:
+        store.path_of("c/k").write_text(came)
+    with pytest.raises(InputDamagedError) as found:
         fetch_capture(store, workspace, work, no_guard)
+    told = failure_of("ingest", found.value)
+    assert (told["code"], told["details"]) == ("input_damaged", {"input": "capture"})
+    assert "Upload the same file again" in told["hint"]
     assert not list(workspace.capture_file.parent.iterdir())
     store.path_of("c/k").write_text("whole")
     fetch_capture(store, workspace, work, no_guard)

@@ -1,0 +1,41 @@
+"""Stored bytes that a stage found missing or damaged: how its error says so, and who asks.
+
+A worker ends the stage with the code INPUT_DAMAGED and `details["input"]`: the stage whose result
+it was, or CAPTURE. A retry runs that stage again; an upload of the same bytes puts them once more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from storage.models import Capture, Job, StageRow
+
+INPUT_DAMAGED = "input_damaged"
+CAPTURE = "capture"
+
+
+def damaged_input(error: Mapping[str, Any] | None) -> str | None:
+    """What a stage's error says was damaged: a stage's name, or CAPTURE; None for another error."""
+    if not error or error.get("code") != INPUT_DAMAGED:
+        return None
+    name: str | None = (error.get("details") or {}).get("input")
+    return name
+
+
+def is_found_damaged(session: Session, blob_id: str) -> bool:
+    """Whether a stage on a capture of these bytes ended so, and has not begun anew since."""
+    query = (
+        select(StageRow.id)
+        .join(Job, Job.id == StageRow.job_id)
+        .join(Capture, Capture.id == Job.capture_id)
+        .where(
+            Capture.blob_id == blob_id,
+            StageRow.error["code"].as_string() == INPUT_DAMAGED,
+            StageRow.error[("details", "input")].as_string() == CAPTURE,
+        )
+    )
+    return session.scalar(query.limit(1)) is not None
