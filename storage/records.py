@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import delete, func, insert, select
+from sqlalchemy import delete, func, insert, select, text
 from sqlalchemy.orm import Session
 
 from storage.blobs import drop_blob, take_blob
@@ -21,6 +22,10 @@ from storage.tenants import DEFAULT_TENANT
 WORKER_LIVE_S = 60.0
 WORKER_KEPT = timedelta(days=1)
 MAX_LOG_LINES = 20_000
+"""Of one attempt."""
+MAX_STAGE_LOG_LINES = 60_000
+"""Of all attempts of a stage, but for MIN_LOG_LINES that each may write in any case."""
+MIN_LOG_LINES = 1_000
 MAX_LINE_CHARS = 2_000
 
 
@@ -167,24 +172,52 @@ def has_live_gpu(session: Session, when: datetime | None = None) -> bool:
     return any(worker.has_gpu and "gpu" in worker.queues for worker in live_workers(session, when))
 
 
+def _take_turn(session: Session, job_id: str) -> None:
+    """Wait until who adds to the same job's log has committed, so that ids follow one another as
+    the lines appear: readers count on it.
+
+    A lock of its own, which keeps nobody from claiming or ending a stage; a session that writes
+    holds all of SQLite as it is.
+    """
+    if session.get_bind().dialect.name == "postgresql":
+        digest = hashlib.blake2b(f"log:{job_id}".encode(), digest_size=8).digest()
+        key = int.from_bytes(digest, signed=True)
+        session.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": key})
+
+
+def _log_room(session: Session, claim: Claim, began_at: datetime | None) -> tuple[int, int]:
+    """How many lines a claim may write in all, and how many it still may.
+
+    began_at: None where the stage waits for its next claim.
+    """
+    written = select(func.count()).select_from(LogLine)
+    written = written.where(LogLine.job_id == claim.job_id, LogLine.stage == claim.name)
+    of_stage = of_claim = session.scalars(written).one()
+    if began_at is not None and of_stage:
+        of_claim = session.scalars(written.where(LogLine.created_at >= began_at)).one()
+    left = max(MAX_STAGE_LOG_LINES - (of_stage - of_claim), MIN_LOG_LINES)
+    allowed = min(left, MAX_LOG_LINES)
+    return allowed, max(allowed - of_claim, 0)
+
+
 def append_logs(
     session: Session, claim: Claim, lines: Sequence[str], when: datetime | None = None
 ) -> int:
-    """Add lines that a stage wrote, up to MAX_LOG_LINES a stage. Returns how many were kept.
+    """Add lines that a stage wrote, up to MAX_LOG_LINES an attempt. Returns how many were kept.
 
     None of a claim that another one has replaced, or whose job was deleted. Until the lines are
-    committed nobody deletes the job.
+    committed nobody deletes the job, or adds others to its log.
     """
-    query = select(StageRow.lease_token, StageRow.tenant_id).where(StageRow.id == claim.stage_id)
+    _take_turn(session, claim.job_id)
+    query = select(StageRow.lease_token, StageRow.tenant_id, StageRow.started_at)
+    query = query.where(StageRow.id == claim.stage_id)
     row = session.execute(query.with_for_update(read=True, key_share=True)).one_or_none()
     if row is None or row.lease_token > claim.token:
         return 0
-    mine = (LogLine.job_id == claim.job_id, LogLine.stage == claim.name)
-    held = session.scalars(select(func.count()).select_from(LogLine).where(*mine)).one()
-    room = max(MAX_LOG_LINES - held, 0)
+    allowed, room = _log_room(session, claim, row.started_at)
     kept = [clean_text(line, MAX_LINE_CHARS) for line in lines[:room]]
     if kept and len(kept) == room:
-        kept[-1] = f"[the log ends here: {MAX_LOG_LINES} lines are kept of a stage]"
+        kept[-1] = f"[the log ends here: {allowed} lines are kept of this attempt]"
     if kept:
         moment = when or now(session)
         common = {
@@ -201,7 +234,10 @@ def append_logs(
 def read_logs(
     session: Session, job_id: str, *, stage: str | None = None, line: int = 0, limit: int = 1000
 ) -> LogPage:
-    """Lines from number `line` on, of one stage or all; a negative `line` counts from the end."""
+    """Lines from number `line` on, of one stage or all; a negative `line` counts from the end.
+
+    A line keeps its number: later ones are added behind it.
+    """
     conditions = [LogLine.job_id == job_id]
     if stage is not None:
         conditions.append(LogLine.stage == stage)

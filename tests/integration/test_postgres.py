@@ -149,6 +149,38 @@ def wait_for_a_lock(database: Database) -> None:
         time.sleep(0.02)
 
 
+def test_who_follows_a_log_sees_each_line_once_beside_two_stages_that_write(
+    database: Database,
+) -> None:
+    side = (StageSeed("evaluate", ()), StageSeed("mesh", ()))
+    seen: list[str] = []
+
+    def follow() -> None:
+        with database.read_scope() as session:
+            seen.extend(read_logs(session, job, line=len(seen)).lines)
+
+    def add(number: int) -> int:
+        with database.session_scope() as session:
+            return append_logs(session, claims[number], [f"{number}.{line}" for line in range(3)])
+
+    with database.session_scope() as session:
+        job = make_job(session, side).id
+        found = [claim_stage(session, stage_id(job, seed.name), "w", 60.0) for seed in side]
+        claims = [claim for claim in found if claim is not None]
+    with ThreadPoolExecutor(1) as pool:
+        with database.session_scope() as session:
+            append_logs(session, claims[0], ["0.a", "0.b"])
+            other = pool.submit(add, 1)
+            wait_for_a_lock(database)
+            with database.session_scope() as third:  # the rows of the job are nobody's meanwhile
+                succeed_stage(third, claims[1], manifest={}, output_prefix="p/")
+            follow()
+        follow()
+        assert other.result(10) == 3
+    follow()
+    assert seen == ["0.a", "0.b", "1.0", "1.1", "1.2"]
+
+
 @pytest.mark.parametrize("first", ["lines", "deletion"])
 def test_a_job_is_deleted_beside_a_late_log_line(database: Database, first: str) -> None:
     """The worker still flushes what the cancelled stage wrote."""

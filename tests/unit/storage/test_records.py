@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from storage import api_keys
+from storage import api_keys, records
 from storage.claims import Claim, claim_stage
 from storage.db import Database, now
 from storage.deletions import drain_deletions
 from storage.errors import ConflictError, InvalidCursorError, NotFoundError
-from storage.jobs import request_cancel, stage_id
+from storage.jobs import open_for_retry, request_cancel, retry_job, stage_id
+from storage.leases import fail_stage
 from storage.models import ApiKey, Capture, Worker
 from storage.objects_local import LocalObjectStore
 from storage.queries import get_job, list_captures, list_jobs, queue_position
@@ -117,6 +118,32 @@ def test_the_log_of_a_stage_is_bounded(database: Database) -> None:
         assert append_logs(session, claim, ["x"] * (MAX_LOG_LINES + 5)) == MAX_LOG_LINES
         assert append_logs(session, claim, ["y"]) == 0
         assert "ends here" in read_logs(session, job, line=-1).lines[0]
+
+
+def test_every_attempt_can_write_down_why_it_failed(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "MAX_LOG_LINES", 50)
+    monkeypatch.setattr(records, "MAX_STAGE_LOG_LINES", 120)
+    monkeypatch.setattr(records, "MIN_LOG_LINES", 10)
+    written = []
+    with database.session_scope() as session:
+        job = make_job(session).id
+    for number in range(5):
+        when = T0 + timedelta(minutes=number)
+        with database.session_scope() as session:
+            claim = claim_stage(session, stage_id(job, "first"), "w", 60.0, when=when)
+            assert claim is not None
+            kept = [append_logs(session, claim, ["x"] * 30, when=when) for _ in range(3)]
+            written.append(sum(kept))
+            assert "ends here" in read_logs(session, job, line=-1).lines[0]
+        with database.session_scope() as session:
+            fail_stage(session, claim, {"code": "c"}, retryable=number % 2 == 0, when=when)
+            if number % 2:
+                found = open_for_retry(session, job)
+                retry_job(session, found, ["first"], {}, changes={}, when=when)
+                assert append_logs(session, claim, ["late"], when=when) == 0
+    assert written == [50, 50, 20, 10, 10]
 
 
 def test_a_gpu_counts_while_its_worker_is_live_and_serves_gpu_stages(database: Database) -> None:
