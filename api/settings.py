@@ -30,7 +30,7 @@ class ApiSettings(StorageSettings):
         30.0, gt=0, description="Longest that the body of any other call may take, in seconds."
     )
     min_free_bytes: int = Field(
-        2**30, ge=0, description="Bytes that an upload must leave free on the staging disk."
+        2**30, ge=0, description="Bytes that an upload must leave free on disk."
     )
     max_body_bytes: int = Field(
         2**20, ge=2**10, description="Largest body of any other call, in bytes."

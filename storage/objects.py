@@ -38,8 +38,18 @@ class ObjectEntry:
 class ObjectStore(Protocol):
     """Where captures, stage folders and artifacts live."""
 
-    def put_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
-        """Store a file's content under a key, replacing what was there."""
+    def put_file(
+        self, key: str, path: Path, on_bytes: OnBytes | None = None, *, final: bool = False
+    ) -> None:
+        """Store a file's content under a key, replacing what was there.
+
+        final: nobody writes to the file any more, so that the store may hold it instead of a copy.
+        The caller removes its name all the same.
+        """
+
+    def copies_into(self, path: Path) -> Path | None:
+        """The folder of this machine into which a final file would be copied; None where storing
+        it takes no room here beside its own."""
 
     def get_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
         """Write an object to a file, which appears whole or not at all."""

@@ -19,6 +19,7 @@ from storage.objects import CHUNK_BYTES, ObjectEntry, ObjectStat, OnBytes, check
 from storage.signed_urls import SignedObject, make_object_token
 
 _TEMPORARY = ".nerfworks-tmp"
+_NO_LINK = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
@@ -49,6 +50,29 @@ def copy_file(source: Path, target: Path, on_bytes: OnBytes | None = None) -> No
         temporary.unlink(missing_ok=True)
 
 
+def _link_file(source: Path, target: Path, on_bytes: OnBytes | None = None) -> bool:
+    """Give the file a second name, as `copy_file` would: on disk, and at once.
+
+    False, and nothing is done, on another disk or where a file has one name only.
+    """
+    temporary = target.with_name(f"{target.name}.{secrets.token_hex(6)}{_TEMPORARY}")
+    try:
+        with source.open("rb") as file:
+            try:
+                os.link(source, temporary)
+            except OSError as error:
+                if error.errno not in _NO_LINK:
+                    raise
+                return False
+            os.fsync(file.fileno())
+            if on_bytes is not None:
+                on_bytes(os.fstat(file.fileno()).st_size)
+        temporary.replace(target)
+        return True
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 class LocalObjectStore:
     """Objects as files below one folder; signed URLs are served by the API."""
 
@@ -61,8 +85,13 @@ class LocalObjectStore:
         """Where the object lies, or would lie."""
         return self.root / check_key(key)
 
-    def put_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
-        """Store a file's content under a key, replacing what was there."""
+    def put_file(
+        self, key: str, path: Path, on_bytes: OnBytes | None = None, *, final: bool = False
+    ) -> None:
+        """Store a file's content under a key, replacing what was there.
+
+        A final file becomes the object where both lie on one disk.
+        """
         target = self.path_of(key)
         if not path.is_file():
             raise FileNotFoundError(path)
@@ -70,10 +99,22 @@ class LocalObjectStore:
             while True:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 try:
-                    return copy_file(path, target, on_bytes)
+                    if not (final and _link_file(path, target, on_bytes)):
+                        copy_file(path, target, on_bytes)
+                    return
                 except FileNotFoundError:
                     if target.parent.is_dir():
                         raise  # else a deletion next to us took the folder away: once more
+
+    def copies_into(self, path: Path) -> Path | None:
+        """The store's folder, where a final file cannot become an object. It is tried."""
+        with _translated("the object store"):
+            self.root.mkdir(parents=True, exist_ok=True)
+            probe = self.root / f"probe.{secrets.token_hex(6)}{_TEMPORARY}"
+            try:
+                return None if _link_file(path, probe) else self.root
+            finally:
+                probe.unlink(missing_ok=True)
 
     def get_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
         """Write an object to a file, which appears whole or not at all."""

@@ -63,12 +63,19 @@ class S3ObjectStore:
     def _full(self, key: str) -> str:
         return self._prefix + check_key(key)
 
-    def put_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
+    def put_file(
+        self, key: str, path: Path, on_bytes: OnBytes | None = None, *, final: bool = False
+    ) -> None:
         """Store a file's content under a key, replacing what was there."""
+        del final
         with _translated(key):
             self._client.upload_file(
                 str(path), self._bucket, self._full(key), Callback=on_bytes, Config=_TRANSFER
             )
+
+    def copies_into(self, path: Path) -> None:
+        """None: what is stored takes no room here."""
+        del path
 
     def get_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
         """Write an object to a file, which appears whole or not at all."""

@@ -12,7 +12,7 @@ from fastapi import Body as JsonBody
 from starlette.requests import ClientDisconnect
 
 from api.captures import service
-from api.captures.receiving import Body, Limits, receive, staging_file
+from api.captures.receiving import Body, receive, staging_file
 from api.captures.schemas import CapturePage, CaptureView
 from api.codes import BODY as JSON_BODY
 from api.codes import CAPTURE, ONCE, UPLOAD
@@ -71,13 +71,13 @@ async def create_capture(
 ) -> Response:
     """Upload a capture as multipart part `file`. What it is, the bytes decide."""
     settings = services.settings
-    limits = Limits(settings.max_upload_bytes, settings.min_free_bytes)
     body = Body(request.receive, settings.min_upload_bytes_per_s)
     headers = request.headers
     with ExitStack() as held:
         try:
             held.enter_context(services.taking_an_upload())
             staging = held.enter_context(staging_file(settings.staging_dir))
+            limits = await asyncio.to_thread(service.limits, services, staging[0])
             received = await receive(
                 body,
                 headers.get("content-type"),

@@ -49,10 +49,13 @@ SUFFIX = ".upload"
 
 @dataclass(frozen=True)
 class Limits:
-    """What an upload may take. min_free_bytes: what must stay free on the staging disk."""
+    """What an upload may take. min_free_bytes: what must stay free on the staging disk, and where
+    what has come is copied into another folder, on that folder's disk.
+    """
 
     max_bytes: int
     min_free_bytes: int
+    copied_into: Path | None = None
 
     def check_length(self, content_length: str | None) -> int:
         """The announced length, 0 if none. Raises TooLargeError for one that cannot fit."""
@@ -63,10 +66,17 @@ class Limits:
             raise self.too_large()
         return length
 
-    def check_disk(self, folder: Path, coming: int) -> None:
-        """Raises NoSpaceError where `coming` more bytes would leave too little room."""
-        if shutil.disk_usage(folder).free - coming < self.min_free_bytes:
-            raise NoSpaceError("The service has too little disk left for this upload.")
+    def check_disk(self, folder: Path, coming: int, came: int = 0) -> None:
+        """Raises NoSpaceError where `coming` more bytes, and the copy of them and of those that
+        came before, would leave too little room."""
+        needed = {folder.stat().st_dev: (folder, coming)}
+        if self.copied_into is not None:
+            disk = self.copied_into.stat().st_dev
+            _, here = needed.get(disk, (self.copied_into, 0))
+            needed[disk] = (self.copied_into, here + came + coming)
+        for place, num_bytes in needed.values():
+            if shutil.disk_usage(place).free - num_bytes < self.min_free_bytes:
+                raise NoSpaceError("The service has too little disk left for this upload.")
 
     def too_large(self) -> TooLargeError:
         """The error of an upload that is too large."""
@@ -314,7 +324,7 @@ async def receive(
             await asyncio.to_thread(write_pending)
         if part.size - checked_at >= CHECK_DISK_BYTES:
             checked_at = part.size
-            limits.check_disk(path.parent, 0)
+            limits.check_disk(path.parent, 0, part.size)
     if part.filename is None:
         raise InvalidRequestError(
             "The form has no part named 'file'.",

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
+from pathlib import Path
 
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 from starlette.responses import Response
 
-from api.captures.receiving import Received
+from api.captures.receiving import Limits, Received
 from api.captures.schemas import CaptureView
 from api.deps import DELETE_WAIT_S, Services
 from api.idempotency import Done, Once, do_once
@@ -17,10 +18,19 @@ from pipelines.captures.sniff import Sniffed, sniff
 from storage import records
 from storage.blobs import find_blob
 from storage.damage import is_found_damaged
-from storage.errors import BlobMissingError, ObjectMissingError, ObjectStoreError
+from storage.errors import BlobMissingError, ObjectMissingError, ObjectStoreError, StorageError
 from storage.keys import blob_content
 from storage.models import new_id
 from storage.steps import reached
+
+
+def limits(services: Services, staging: Path) -> Limits:
+    """What an upload to this staging file may take."""
+    copied_into = None
+    with contextlib.suppress(StorageError):  # it will be told when the upload is stored
+        copied_into = services.store.copies_into(staging)
+    settings = services.settings
+    return Limits(settings.max_upload_bytes, settings.min_free_bytes, copied_into)
 
 
 def keep(services: Services, received: Received, once: Once) -> Response:
@@ -38,7 +48,7 @@ def keep(services: Services, received: Received, once: Once) -> Response:
     if found is not None:
         with contextlib.suppress(BlobMissingError):  # it went since: these are needed after all
             if is_damaged or not _lies_there(services, found.object_key, received.bytes):
-                services.store.put_file(found.object_key, received.path)
+                services.store.put_file(found.object_key, received.path, final=True)
             return upload.record(brought=None)[0].response
     return _store_and_record(upload)
 
@@ -94,7 +104,8 @@ def _store_and_record(upload: _Upload) -> Response:
     key = blob_content(upload.tenant_id, upload.received.sha256, new_id())
     folder = key.removesuffix("content")
     try:
-        store.put_file(key, upload.received.path, lambda count: reached("capture.bytes"))
+        path = upload.received.path
+        store.put_file(key, path, lambda count: reached("capture.bytes"), final=True)
         reached("capture.put")
         done, named = upload.record(brought=key)
     except DBAPIError:

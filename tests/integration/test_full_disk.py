@@ -5,6 +5,8 @@ Whoever asks is told what is wrong, nothing half-written is listed, and no work 
 
 from __future__ import annotations
 
+import errno
+import os
 import secrets
 import threading
 from collections.abc import Iterator
@@ -39,8 +41,11 @@ def disk() -> Iterator[Path]:
         yield folder
 
 
-def test_an_upload_to_a_full_disk_is_told_so_and_leaves_nothing(disk: Path, tmp_path: Path) -> None:
-    """Where it comes in and where it is stored are on it."""
+@pytest.mark.parametrize("has_links", [True, False])
+def test_an_upload_to_a_full_disk_is_told_so_and_leaves_nothing(
+    disk: Path, tmp_path: Path, has_links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where it comes in and where it is stored are on it: with links it takes its size once."""
     home = tmp_path / "home"
     home.mkdir()
     (disk / "staging").mkdir()
@@ -51,6 +56,8 @@ def test_an_upload_to_a_full_disk_is_told_so_and_leaves_nothing(disk: Path, tmp_
         return {path for one in folders for path in one.rglob("*") if path.is_file()}
 
     with serving(settings_for(home, objects_url=(disk / "objects").as_uri())) as service:
+        if not has_links:
+            forbid_links(monkeypatch)
         service.upload()
         film = b"\0\0\0\x18ftypisom\0\0\2\0isomiso2" + secrets.token_bytes(FILE_BYTES)
         once = {"Idempotency-Key": "one-film"}
@@ -63,11 +70,40 @@ def test_an_upload_to_a_full_disk_is_told_so_and_leaves_nothing(disk: Path, tmp_
         fill(disk)
         assert problem(send(film), 507, "disk_full")["hint"]
         (disk / FILLER).open("rb+").truncate(DISK_BYTES - FILE_BYTES - FILE_BYTES // 2)
-        problem(send(film), 507, "disk_full")  # it comes in, and does not fit into the store
+        if has_links:
+            made = send(film)
+            assert made.status_code == 201, made.text
+            (stored,) = files() - before
+            assert (stored.read_bytes(), stored.stat().st_nlink) == (film, 1)
+            return
+        problem(send(film), 507, "disk_full")  # it would come in, and not fit into the store
         assert files() == before
         assert len(service.http.get("/v1/captures").json()["items"]) == 1
         free(disk)
         assert send(film).status_code == 201
+
+
+def test_an_upload_leaves_free_what_it_must_where_it_is_stored(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It comes in on another disk, and is copied."""
+    objects, film = disk / "objects", b"\0\0\0\x18ftypisom" + secrets.token_bytes(FILE_BYTES)
+    settings = settings_for(
+        tmp_path / "home", objects_url=objects.as_uri(), min_free_bytes=DISK_BYTES - FILE_BYTES
+    )
+    with serving(settings) as service:
+        monkeypatch.setattr(LocalObjectStore, "put_file", None)  # it does not come so far
+        answer = service.http.post("/v1/captures", files={"file": ("film.mp4", film)})
+        problem(answer, 507, "disk_full")
+
+
+def forbid_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a file system that has none."""
+
+    def refuse(source: Path, target: Path) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
 
 
 def test_a_database_on_a_full_disk_is_told_so_and_still_read(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -87,8 +88,9 @@ def test_keys_that_could_leave_the_folder_are_refused(key: str) -> None:
     ("number", "expected"),
     [(errno.ENOSPC, ObjectStoreFullError), (errno.EIO, ObjectStoreError)],
 )
+@pytest.mark.parametrize("final", [False, True])
 def test_a_failed_put_leaves_the_old_object_and_no_scraps(
-    store: LocalObjectStore, tmp_path: Path, number: int, expected: type[Exception]
+    store: LocalObjectStore, tmp_path: Path, number: int, expected: type[Exception], final: bool
 ) -> None:
     put(store, tmp_path, "a/k", b"old")
 
@@ -97,9 +99,44 @@ def test_a_failed_put_leaves_the_old_object_and_no_scraps(
 
     (tmp_path / "source").write_bytes(b"new")
     with pytest.raises(expected):
-        store.put_file("a/k", tmp_path / "source", fail)
+        store.put_file("a/k", tmp_path / "source", fail, final=final)
     assert b"".join(store.read("a/k")) == b"old"
     assert [path.name for path in (store.root / "a").iterdir()] == ["k"]
+
+
+def test_a_final_file_takes_no_room_of_its_own(store: LocalObjectStore, tmp_path: Path) -> None:
+    put(store, tmp_path, "a/copy", b"x")
+    put(store, tmp_path, "a/k", b"old")
+    source, moved = tmp_path / "source", list[int]()
+    source.write_bytes(b"new")
+    assert store.copies_into(source) is None
+    for _ in range(2):  # the same file once more, too
+        store.put_file("a/k", source, moved.append, final=True)
+    store.put_file("a/other", source, final=True)
+    assert moved == [3, 3]
+    assert store.path_of("a/k").samefile(source)
+    assert not store.path_of("a/copy").samefile(source)
+    source.unlink()
+    store.delete("a/other")
+    assert b"".join(store.read("a/k")) == b"new"
+    assert sorted(path.name for path in store.root.rglob("*")) == ["a", "copy", "k"]
+
+
+@pytest.mark.parametrize("number", [errno.EXDEV, errno.EPERM, errno.EOPNOTSUPP])
+def test_a_final_file_that_cannot_be_linked_is_copied(
+    store: LocalObjectStore, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(source: Path, target: Path) -> None:
+        raise OSError(number, "as the disk would say")
+
+    monkeypatch.setattr(os, "link", refuse)
+    source = tmp_path / "source"
+    source.write_bytes(b"new")
+    assert store.copies_into(source) == store.root
+    store.put_file("a/k", source, final=True)
+    assert not store.path_of("a/k").samefile(source)
+    assert b"".join(store.read("a/k")) == b"new"
+    assert sorted(path.name for path in store.root.rglob("*")) == ["a", "k"]
 
 
 def test_a_signed_url_allows_one_object_for_a_time(store: LocalObjectStore) -> None:

@@ -68,7 +68,10 @@ def test_the_manifest_is_uploaded_last(store: LocalObjectStore, tmp_path: Path) 
     order: list[str] = []
 
     class Watching(LocalObjectStore):
-        def put_file(self, key: str, path: Path, on_bytes: OnBytes | None = None) -> None:
+        def put_file(
+            self, key: str, path: Path, on_bytes: OnBytes | None = None, *, final: bool = False
+        ) -> None:
+            assert not final, "a stage may still write to it"
             order.append(key)
             super().put_file(key, path, on_bytes)
 
