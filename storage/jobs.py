@@ -16,6 +16,7 @@ from typing import Any
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session, joinedload, selectinload
 
+from storage.damage import damaged_input
 from storage.db import now
 from storage.errors import ConflictError, NotFoundError
 from storage.keys import job_root
@@ -58,6 +59,13 @@ _UNTRIED: dict[str, Any] = {
     "report_files": None,
 }
 """Of a stage that is done again. What its last success published it keeps until the next."""
+_UNMADE: dict[str, Any] = {
+    "output_prefix": None,
+    "summary": None,
+    "manifest": None,
+    "fingerprint": None,
+}
+"""Of one whose files were found damaged, too: they are no result."""
 
 
 @dataclass(frozen=True)
@@ -239,18 +247,20 @@ def retry_job(
     stage that had not succeeded, which decides itself whether it fits its options. Behind a stage
     that is done again no checkpoint is kept: it was begun on inputs that are no more. What a stage
     that is done again had published stays its own until it has succeeded anew: where that does not
-    happen it is its result again (`storage.transitions.put_back`). So it is of a stage that ended
-    badly and is not done again.
+    happen it is its result again (`storage.transitions.put_back`), unless a later stage found it
+    damaged. So it is of a stage that ended badly and is not done again.
     """
     when = when or now(session)
     stages = list(job.stages)
     moved = _with_other_inputs(stages, redo)
+    damaged = {damaged_input(row.error) for row in stages}
     for row in stages:
         gone, kept = [row.report_prefix], row.checkpoint_prefix
         if row.name in redo:
             if row.name in moved:
                 gone, kept = [*gone, kept], None
             values = {**_UNTRIED, "checkpoint_prefix": kept}
+            values |= _UNMADE if row.name in damaged else {}
             set_stage(session, row, "blocked", when, reason="retry", **values)
         elif row.state in ("failed", "cancelled") and row.output_prefix is not None:
             restore(session, row, when)
