@@ -53,8 +53,8 @@ def take_bootstrap_key(session: Session, key: str) -> ApiKey:
 
     A key that was replaced, or revoked, never becomes valid again: processes that still have it in
     their settings change nothing, in whatever order they start. The record says whether it was
-    (`revoked_at`). Where several are valid, as earlier versions left them, the newest holds. What
-    was made with the others is their tenant's, and so the new one's.
+    (`revoked_at`). Of several that are valid, as earlier versions left them, that of the settings
+    holds. What was made with the others is their tenant's, and so the new one's.
     """
     if session.get_bind().dialect.name == "postgresql":
         session.execute(select(func.pg_advisory_xact_lock(_LOCK)))
@@ -65,10 +65,9 @@ def take_bootstrap_key(session: Session, key: str) -> ApiKey:
     found = ensure_api_key(session, key, BOOTSTRAP, tenant_id)
     if found.revoked_at is not None:
         return found
-    newest = valid[-1] if found in valid else found
-    newest.name = BOOTSTRAP
+    found.name = BOOTSTRAP
     for record in valid:
-        if record is not newest:
+        if record is not found:
             record.revoked_at = now(session)
             _log.warning("the API key %s of earlier settings is revoked", record.id)
     return found

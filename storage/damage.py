@@ -26,6 +26,22 @@ def damaged_input(error: Mapping[str, Any] | None) -> str | None:
     return name
 
 
+def damaged_results(session: Session, job: Job) -> set[str]:
+    """The job's stages whose results a stage has found damaged, one of it or of an export of it,
+    and that were not made anew since."""
+    found = {name for row in job.stages if (name := damaged_input(row.error)) is not None}
+    made_at = {row.name: row.finished_at for row in job.stages}
+    exports = select(StageRow.error, StageRow.finished_at).join(Job, Job.id == StageRow.job_id)
+    for error, when in session.execute(
+        exports.where(Job.parent_id == job.id, StageRow.state == "failed")
+    ):
+        name = damaged_input(error)
+        made = made_at.get(name or "")
+        if name is not None and made is not None and when is not None and made < when:
+            found.add(name)
+    return found
+
+
 def is_found_damaged(session: Session, blob_id: str) -> bool:
     """Whether a stage on a capture of these bytes ended so, and has not begun anew since."""
     query = (

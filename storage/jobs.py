@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session, joinedload, selectinload
 
-from storage.damage import damaged_input
+from storage.damage import damaged_results
 from storage.db import now
 from storage.errors import ConflictError, NotFoundError
 from storage.keys import job_root
@@ -253,7 +253,7 @@ def retry_job(
     when = when or now(session)
     stages = list(job.stages)
     moved = _with_other_inputs(stages, redo)
-    damaged = {damaged_input(row.error) for row in stages}
+    damaged = damaged_results(session, job)
     for row in stages:
         gone, kept = [row.report_prefix], row.checkpoint_prefix
         if row.name in redo:

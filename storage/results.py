@@ -22,7 +22,8 @@ def fitting(stages: Iterable[StageRow]) -> dict[str, StageRow]:
     """The stages, by name, whose results go together.
 
     stages: in order. What a stage had made before fits as long as all that it was made of is what
-    the job has now: the `inputs` of its manifest name the `content` of each.
+    the job has now: the `inputs` of its manifest name the `content` of each. One without content is
+    the report of a failure, as workers of earlier versions leave it.
     """
     rows = {row.name: row for row in stages}
     fit: dict[str, StageRow] = {}
@@ -33,8 +34,9 @@ def fitting(stages: Iterable[StageRow]) -> dict[str, StageRow]:
 
 
 def _fits(row: StageRow, rows: dict[str, StageRow], fit: dict[str, StageRow]) -> bool:
-    inputs = (row.manifest or {}).get("inputs", {})
-    return all(
+    made = row.manifest or {}
+    inputs = made.get("inputs", {})
+    return "content" in made and all(
         name in fit and (fit[name].manifest or {}).get("content") == content
         for name, content in inputs.items()
         if name in rows  # else the upload, or of the job that this one is an export of

@@ -166,7 +166,7 @@ def _input_damaged(stage: str, error: InputDamagedError) -> dict[str, Any]:
         hint = "Upload the same file again, which replaces what is stored; then retry the job."
     elif error.of_parent:
         what = f"What {error.name} made"
-        hint = f"Retry the export's job from the stage {error.name}; then retry the export."
+        hint = f"Retry the export's job, which runs {error.name} again; then retry the export."
     else:
         what, hint = f"What {error.name} made", f"Retry the job, which runs {error.name} again."
     return PipelineError(

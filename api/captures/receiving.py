@@ -68,12 +68,14 @@ class Limits:
 
     def check_disk(self, folder: Path, coming: int, came: int = 0) -> None:
         """Raises NoSpaceError where `coming` more bytes, and the copy of them and of those that
-        came before, would leave too little room."""
+        came before, would leave too little room. Waits for the disks; a folder for copies that is
+        gone is told when the upload is stored."""
         needed = {folder.stat().st_dev: (folder, coming)}
         if self.copied_into is not None:
-            disk = self.copied_into.stat().st_dev
-            _, here = needed.get(disk, (self.copied_into, 0))
-            needed[disk] = (self.copied_into, here + came + coming)
+            with contextlib.suppress(OSError):
+                disk = self.copied_into.stat().st_dev
+                _, here = needed.get(disk, (self.copied_into, 0))
+                needed[disk] = (self.copied_into, here + came + coming)
         for place, num_bytes in needed.values():
             if shutil.disk_usage(place).free - num_bytes < self.min_free_bytes:
                 raise NoSpaceError("The service has too little disk left for this upload.")
@@ -304,7 +306,8 @@ async def receive(
     path, file = staging
     part = _FilePart(limits)
     parser = _parser(content_type, part)
-    limits.check_disk(path.parent, limits.check_length(content_length))
+    coming = limits.check_length(content_length)
+    await asyncio.to_thread(limits.check_disk, path.parent, coming)
     digest = hashlib.sha256()
     checked_at = 0
 
@@ -324,7 +327,7 @@ async def receive(
             await asyncio.to_thread(write_pending)
         if part.size - checked_at >= CHECK_DISK_BYTES:
             checked_at = part.size
-            limits.check_disk(path.parent, 0, part.size)
+            await asyncio.to_thread(limits.check_disk, path.parent, 0, part.size)
     if part.filename is None:
         raise InvalidRequestError(
             "The form has no part named 'file'.",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -16,7 +16,7 @@ from pipelines.options import OptionsError, revise_options
 from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, get_stage
 from storage import jobs
-from storage.damage import damaged_input
+from storage.damage import damaged_results
 from storage.exports import live_exports
 from storage.models import Job, StageRow
 from storage.results import is_offered
@@ -40,15 +40,17 @@ def _holds(row: StageRow, rows: Mapping[str, StageRow], options: dict[str, Any],
 
 
 def stages_to_redo(
-    job: Job, options: dict[str, dict[str, Any]], from_stage: str | None = None
+    job: Job,
+    options: dict[str, dict[str, Any]],
+    from_stage: str | None = None,
+    damaged: Collection[str] = (),
 ) -> list[str]:
     """The stages whose results do not hold with these options, in order, and all behind them.
 
-    from_stage: one that is run again in any case. So is one whose files a later stage found damaged
-    in the object store; and what failed, unless other options than it failed with are those of what
-    it had made before. An export reads what its job has made.
+    from_stage: one that is run again in any case. damaged: so are those, whose results are not in
+    the object store as they were put there. What failed is, too, unless other options than it
+    failed with are those of what it had made before. An export reads what its job has made.
     """
-    damaged = {damaged_input(row.error) for row in job.stages}
     rows = {row.name: row for row in (*(job.parent.stages if job.parent else ()), *job.stages)}
     behind: set[str] = set()  # what is run again, and skipped stages that only pass it on
     redo = []
@@ -127,7 +129,7 @@ def retry(session: Session, job_id: str, wanted: RetryRequest) -> list[str]:
             code="stage_skipped",
             errors=[FieldProblem(path="from_stage", detail="a stage that the job has")],
         )
-    redo = stages_to_redo(job, options, from_stage)
+    redo = stages_to_redo(job, options, from_stage, damaged_results(session, job))
     if not redo and job.state == "succeeded":
         raise ConflictedError(
             "Every result of the job holds: there is nothing to do again.",

@@ -185,7 +185,9 @@ def _unpacked(file: IO[bytes], chunk_bytes: int, bomb: Bomb) -> Iterator[bytes]:
             if chunk := stream.decompress(piece, chunk_bytes):
                 num_bytes += len(chunk)
                 yield chunk
-            place += len(piece) - len(stream.unconsumed_tail) - len(stream.unused_data)
+            # A member that ends as it is drained leaves its last tail in both.
+            left = stream.unused_data if stream.eof else stream.unconsumed_tail
+            place += len(piece) - len(left)
             piece_bytes = min(2 * piece_bytes, _CHUNK_BYTES)
         spare = min(spare + num_bytes // BLOCK_BYTES, _SHORT_MEMBERS) - 1
         if spare < 0:

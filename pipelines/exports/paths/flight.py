@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STEEP = 1e-4
+_JUMP_DEG, _JUMP_STEPS = 8.0, 6.0
+"""A turn between two frames that is larger, and than so many of the median ones, is a jump."""
 _TRIED_FRAMES = 240
 """In which a path's turning is measured, before it has its own number."""
 _ON_THEIR_SIDE, _CLEARLY = 0.3, 2.0
@@ -43,10 +45,14 @@ class Flight:
         return len(self.poses)
 
     def turned_deg(self) -> float:
-        """How far the cameras turn on the way, degrees."""
+        """How far the cameras turn on the way, degrees, but for where the way jumps."""
         axes = self.poses[:, :, :3]
         trace = np.einsum("nij,nij->n", axes[1:], axes[:-1])
-        return float(np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))).sum())
+        steps = np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
+        if len(steps) == 0:
+            return 0.0
+        jumps = steps > max(_JUMP_DEG, _JUMP_STEPS * float(np.median(steps)))
+        return float(steps[~jumps].sum())
 
     def lens(self, index: int, lens: Pinhole) -> Pinhole:
         """The lens of one frame, from that of the video."""

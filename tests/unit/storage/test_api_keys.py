@@ -58,7 +58,7 @@ def test_no_order_of_starts_brings_a_replaced_key_back(either_database: Database
 
 
 @pytest.mark.parametrize("order", [*itertools.permutations(["oldest", "leaked", "new"])])
-def test_of_several_that_were_valid_before_the_newest_holds_whoever_starts_first(
+def test_of_several_that_were_valid_before_that_of_the_settings_holds(
     database: Database, order: tuple[str, ...]
 ) -> None:
     """Earlier versions revoked none."""
@@ -67,8 +67,8 @@ def test_of_several_that_were_valid_before_the_newest_holds_whoever_starts_first
             record = ensure_api_key(session, key, BOOTSTRAP)
             record.created_at = now(session) - timedelta(days=age)
     for key in order:
-        start(database, key)
-        assert valid(database, "oldest", "leaked", "new") == ["new"]
+        assert start(database, key) == (key == order[0])
+        assert valid(database, "oldest", "leaked", "new") == [order[0]]
 
 
 def test_processes_that_start_at_once_leave_one_valid_key(either_database: Database) -> None:

@@ -282,3 +282,18 @@ def test_what_never_succeeded_has_nothing_to_be_put_back(database: Database) -> 
     assert look(database, job) == {**failed, "second": "cancelled", "job": "cancelled"}
     assert options_of(database, job) == OTHERS
     assert offered(database, job) == {"first"}
+
+
+def test_the_report_of_a_failure_that_an_older_worker_left_is_no_result(
+    database: Database,
+) -> None:
+    """It stands where results do, as a folder with files and no content."""
+    job = new_job(database, options=ASKED)
+    publish(database, claim(database, job, "first"))
+    held = claim(database, job, "second", at=2)
+    with database.session_scope() as session:
+        fail_stage(session, held, ERROR, retryable=False, when=seconds(3))
+        row = session.query(StageRow).filter_by(job_id=job, name="second").one()
+        row.output_prefix, row.manifest = f"{held.root}second/failed/", {"files": []}
+    with database.read_scope() as session:
+        assert {*fitting(get_job(session, job, manifests=True).stages)} == {"first"}

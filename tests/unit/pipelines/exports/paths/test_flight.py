@@ -170,6 +170,13 @@ def test_a_way_that_turns_more_is_filmed_for_longer() -> None:
         assert len(filmed_path(options.model_copy(update=told), _walked(3))) == frames
 
 
+def test_jumps_of_a_way_are_no_turning() -> None:
+    angles = np.radians(np.concatenate([start + np.arange(0.0, 20.0, 0.5) for start in (0, 120)]))
+    places = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
+    turned = Flight(looking_at(3.0 * places, np.zeros(3))).turned_deg()
+    assert turned == pytest.approx(39.0, abs=0.1)
+
+
 def test_how_far_a_way_turns_is_told_in_any_direction() -> None:
     pose = looking_at(np.array([[2.0, 0.0, 0.0]]), np.zeros(3))[0]
     assert Flight(pose[None]).turned_deg() == 0.0
