@@ -191,7 +191,7 @@ def test_members_that_unpack_to_much_are_read_to_their_end(tmp_path: Path) -> No
     rows = (b"%.3f,%d,0,0,0,1.000\n" % (rng.random(), n // 50) for n in range(300_000))
     more = {"poses.csv": b"".join(rows), "film.bin": rng.randbytes(300_000)}
     data = tarred({**more, **PHOTOS})
-    for length in (3 << 20, 4 << 20, 6 << 20):
+    for length in (3 << 20, 5 << 20):
         cuts = range(0, len(data), length)
         packed = b"".join(gzip.compress(data[cut : cut + length]) for cut in cuts)
         (tmp_path / "c").write_bytes(packed)
