@@ -87,7 +87,8 @@ def filmed_path(
     """
     count = options.frames()
     if count is None:
-        count = options.frames_for(make_path(options, images, _TRIED_FRAMES, mesh).turned_deg())
+        # Walls hardly change how far it turns, and take long to read.
+        count = options.frames_for(make_path(options, images, _TRIED_FRAMES).turned_deg())
     return make_path(options, images, count, mesh)
 
 

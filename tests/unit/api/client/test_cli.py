@@ -62,15 +62,6 @@ DRAFT_REPORT: dict[str, Any] = {
 
 
 @pytest.fixture
-def command(live: LiveServer, monkeypatch: pytest.MonkeyPatch) -> LiveServer:
-    """A live server that the command finds through the environment."""
-    monkeypatch.setenv("NERFWORKS_URL", live.url)
-    monkeypatch.setenv("NERFWORKS_API_KEY", KEY)
-    monkeypatch.setenv("COLUMNS", "200")
-    return live
-
-
-@pytest.fixture
 def archive(tmp_path: Path) -> Path:
     path = tmp_path / "garden.zip"
     path.write_bytes(zip_of_pictures())
