@@ -68,10 +68,48 @@ def test_readme_names_every_artifact_and_make_target() -> None:
         assert command in README, f"README.md does not name {command}"
 
 
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def links(page: Path) -> list[tuple[str, str]]:
+    """(file or "" for the page itself, anchor or "") of each link that stays in the repository."""
+    found = re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", page.read_text("utf-8"))
+    return [(target, anchor) for target, anchor in found if "://" not in target]
+
+
+def anchors(page: Path) -> set[str]:
+    """What GitHub makes of a page's headings: letters, digits, hyphens and underscores."""
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    found: list[str] = []
+    for heading in re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE):
+        found.append(re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-"))
+    return {
+        f"{anchor}-{same}" if (same := found[:index].count(anchor)) else anchor
+        for index, anchor in enumerate(found)
+    }
+
+
 def test_links_in_the_documentation_lead_somewhere() -> None:
-    broken = []
-    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
-        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text("utf-8")):
-            if "://" not in target and not (page.parent / target).exists():
-                broken.append(f"{page.name}: {target}")
+    broken = [
+        f"{page.name}: {target}"
+        for page in PAGES
+        for target, _ in links(page)
+        if not (page.parent / target).exists()
+    ]
     assert not broken, f"broken links: {broken}"
+
+
+def test_links_to_headings_find_them() -> None:
+    broken = []
+    for page in PAGES:
+        for target, anchor in links(page):
+            aim = page.parent / target if target else page
+            if anchor and aim.suffix == ".md" and aim.exists() and anchor not in anchors(aim):
+                broken.append(f"{page.name}: {target}#{anchor}")
+    assert not broken, f"links to headings that are not there: {broken}"
+
+
+def test_every_picture_of_the_documentation_is_on_a_page() -> None:
+    shown = {(page.parent / target).resolve() for page in PAGES for target, _ in links(page)}
+    unused = sorted(path.name for path in (ROOT / "docs" / "images").iterdir() if path not in shown)
+    assert not unused, f"pictures that no page shows: {unused}"
