@@ -54,7 +54,7 @@ _CHECKPOINT, _PROGRESS = "training.pt", "progress.json"
 _TRAIN_SHARE = 0.98
 _LEAST_UNKNOWN = 0.36
 """Of what is plain, that no map knows, for plain lines: where maps know the most of it, what they
-mistake at the rims of things goes on into the rest (docs/surfaces.md)."""
+mistake at the rims of things goes on into the rest (docs/surfaces-experiments.md)."""
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,8 @@ _MIN_VIEWS = 2
 _PARALLAX = 0.04
 """Radians, the standard deviation of the directions in which views see a cube: 4.6 degrees between
 two views. What frames of a film show that follow each other is one opinion, however many they are:
-where nobody saw it from elsewhere, it is as likely off the surface. docs/surfaces.md has what was
-measured."""
+where nobody saw it from elsewhere, it is as likely off the surface. What was measured:
+docs/surfaces-experiments.md."""
 _OF_ALL_EYES = 0.06
 """And as a share of what all the views together could have, where that is less: far away."""
 MOST_POINTS = 2_000_000

@@ -1,6 +1,6 @@
 """Every option of dense stereo and its default, once; no torch.
 
-Where the defaults come from: docs/surfaces.md.
+Where the defaults come from: docs/surfaces-experiments.md.
 """
 
 from __future__ import annotations
