@@ -108,7 +108,7 @@ class FlatLossConfig:
 
     when: str = option(
         "unknown",
-        "unknown: where depth maps leave out a third of what is plain in the pictures, and more; "
+        "unknown: where depth maps leave out 0.36 or more of what is plain in the pictures; "
         "the library alone takes it for never.",
         choices=("unknown", "always", "never"),
         former={"around": "unknown"},
