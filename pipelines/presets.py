@@ -32,9 +32,9 @@ _SMALL_PICTURES: dict[str, Any] = {
     "poses": {"max_image_px": 960, "num_features": 4096},
 }
 
-# docs/speed.md, "The preview's rate" and "On an H100", and for cameras docs/poses.md, "Corrected
-# poses", have the measurements. The cameras' counts where they are corrected: a rate that stays
-# leaves each of them off by some of its steps.
+# docs/speed.md, "The preview's rate" and "On an H100", and for cameras docs/poses-experiments.md,
+# "Corrected poses", have the measurements. The cameras' counts where they are corrected: a rate
+# that stays leaves each of them off by some of its steps.
 _FALLING_RATE: dict[str, Any] = {
     "lr_final": 1e-5,
     "decay": "linear",
@@ -86,7 +86,8 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                             "anneal_steps": 300,
                             # In short runs codes cost dBs on held-out views (photos-fox, 300 and
                             # 600 steps, one seed, poses corrected as well: 2 to 4), as in the
-                            # paper's table 2. Corrected poses cost .1 to .3 (docs/poses.md).
+                            # paper's table 2. Corrected poses cost .1 to .3
+                            # (docs/poses-experiments.md).
                             "appearance_dim": 0,
                             "camera_mode": "off",
                         },

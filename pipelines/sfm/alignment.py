@@ -22,7 +22,8 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 
 RADIUS = 5
-"""Of a patch, pixels: 11 x 11. Of 7, points lie a tenth less exactly (docs/poses.md)."""
+"""Of a patch, pixels: 11 x 11. Of 7, points lie a tenth less exactly
+(docs/poses-experiments.md)."""
 SPREAD = 0.6 * RADIUS
 """Standard deviation of the weights, pixels."""
 MAX_STEPS = 8

@@ -1,7 +1,8 @@
 """Climbing the ladder of attempts at a reconstruction.
 
-`pipelines.sfm.rungs` says which attempts there are: first the quick way (docs/poses.md has what was
-measured), then more thorough ones where too few images register. The attempt with most images wins.
+`pipelines.sfm.rungs` says which attempts there are: first the quick way (docs/poses-experiments.md
+has what was measured), then more thorough ones where too few images register. The attempt with most
+images wins.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ MIN_HELD_OUT = 60
 """Held-out observations of a camera below which nothing is said of it."""
 WEAK_PERCENT = 10.0
 """Uncertainty of the focal length from which it is called weak: well filmed captures have 1 to 2,
-one whose rays differ by 6 degrees 4 to 5 (docs/poses.md)."""
+one whose rays differ by 6 degrees 4 to 5 (docs/poses-experiments.md)."""
 
 _CAP = 5.0
 """Errors count up to so many medians: a wrong match says nothing of the lens."""

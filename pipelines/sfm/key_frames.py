@@ -4,7 +4,7 @@ Frames of a long film differ by little, and mapping and matching cost by the fra
 NUM_KEYS of them, spread over each clip, are matched and mapped as a short film is; where two of
 them that follow each other share too little, the frame half way between is one too, until they
 share enough or nothing is left between. Every other frame is matched with the key frames around it
-alone. docs/poses.md, "Long films", has what that costs and saves.
+alone. docs/poses-experiments.md, "Long films", has what that costs and saves.
 """
 
 from __future__ import annotations
