@@ -132,6 +132,8 @@ def _pairs_of(
 def _usual(pairs: npt.NDArray[np.intp], counts: npt.NDArray[np.int64], num: int) -> Floats:
     """[N] the matches that each image usually has with near ones; infinite without any."""
     usual = np.full(num, np.inf)
+    if not len(pairs):
+        return usual
     both = np.concatenate([pairs[:, 0], pairs[:, 1]])
     order = np.argsort(both, kind="stable")
     twice = np.concatenate([counts, counts])[order]

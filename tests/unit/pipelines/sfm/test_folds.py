@@ -86,6 +86,15 @@ def test_a_model_that_is_right_is_not_suspected() -> None:
     assert suspected_folds(placed(folded(true_poses())), matches, counts) == []
 
 
+def test_photos_that_stand_far_apart_all_round_are_no_sides() -> None:
+    """None of them is near another, so that nothing says what should match."""
+    matches, counts = of_two_sides()
+    apart = range(0, NUM, 2)
+    shown = {pair: matches[pair] for pair in matches if pair[0] in apart and pair[1] in apart}
+    assert len(shown) > NUM
+    assert suspected_folds(placed(true_poses(), tuple(apart)), shown, counts) == []
+
+
 def test_close_ups_beside_pictures_of_the_whole_are_no_other_side() -> None:
     """They share little with them, as they show a part; and so do stretches that hardly overlap."""
     matches, counts = of_two_sides()
