@@ -94,6 +94,11 @@ class FramesOptions(StageOptions):
         6, ge=1, le=60, description="Frames looked at per window; the sharpest is taken."
     )
     jpeg_quality: int = Field(95, ge=50, le=100, description="JPEG quality of the frames kept.")
+    find_burned_in: bool = Field(
+        True,
+        description="Cut away bars beside the pictures, and ignore what lies over all of them in "
+        "one place: a date, a logo, a recorded screen's buttons.",
+    )
 
 
 class PosesOptions(StageOptions):

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from pipelines.captures.archive_rules import shown
+from pipelines.captures.common_parts import mask_common_parts
 from pipelines.captures.contents import Photos
 from pipelines.captures.minimum import MIN_IMAGES
 from pipelines.captures.panorama_files import EQUIRECTANGULAR, FOLDER, write_views
@@ -14,7 +15,6 @@ from pipelines.captures.photo_choice import choose_photos
 from pipelines.captures.photo_masks import PhotoMasks, find_masks
 from pipelines.captures.pictures import Picture, PictureWriter
 from pipelines.captures.record import Found
-from pipelines.captures.rims import mask_rims
 from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -48,8 +48,8 @@ def write_photos(
         minimum=MIN_IMAGES,
     )
     plain = [one for one in pictures if not (one.mask or one.cut or one.views)]
-    rims = mask_rims(ctx.out, plain, ctx)
-    pictures = [replace(one, mask=rims.get(one.file, one.mask)) for one in pictures]
+    common = mask_common_parts(ctx.out, plain, ctx)
+    pictures = [replace(one, mask=common.masks.get(one.file, one.mask)) for one in pictures]
     sizes = sorted({(picture.width, picture.height) for picture in pictures})
     return Found(
         images=[picture.as_dict() for picture in pictures],
@@ -57,9 +57,9 @@ def write_photos(
             "num_sizes": len(sizes),
             "largest": list(max(sizes)),
             **masks.details(),
-            **({"num_rims": len(rims)} if rims else {}),
+            **common.details(),
         },
-        warnings=warnings,
+        warnings=warnings + common.warnings(),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipelines.captures.archive_rules import shown
+from pipelines.captures.common_parts import mask_common_parts
 from pipelines.captures.contents import PosedPictures, PosedSource, Rows, SparsePoints
 from pipelines.captures.depth_files import DepthWriter
 from pipelines.captures.films import FilmFrames
@@ -22,7 +23,6 @@ from pipelines.captures.photo_masks import NO_MASKS, PhotoMasks, find_masks
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
 from pipelines.captures.pose_order import proven
 from pipelines.captures.record import Found, FoundPoints
-from pipelines.captures.rims import mask_rims
 from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.captures.world import Move, settled
@@ -99,7 +99,7 @@ def write_posed(
         [name for item in sources for name in item.depth_files], "their pictures are left out"
     )
     plain = [item.picture for item in stored if item.mask is None and item.picture.cut is None]
-    rims = mask_rims(ctx.out, plain, ctx)
+    common = mask_common_parts(ctx.out, plain, ctx)
     cameras: dict[Intrinsics, int] = {}
     poses = np.array([item.world_from_camera for item in stored], np.float64)
     orientations = [item.picture.exif.orientation for item in stored]
@@ -112,7 +112,7 @@ def write_posed(
             camera=cameras.setdefault(item.lens, len(cameras)),
             world_from_camera=_rows(pose),
             timestamp_s=item.timestamp_s,
-            mask=rims.get(item.picture.file, item.mask),
+            mask=common.masks.get(item.picture.file, item.mask),
             depth=item.depth,
             depth_lens=item.depth_lens,
             cut=item.picture.cut,
@@ -134,7 +134,7 @@ def write_posed(
             "num_depths": sum(image.depth is not None for image in images),
             "metric": capture.metric,
             **beside.details(),
-            **({"num_rims": len(rims)} if rims else {}),
+            **common.details(),
             **capture.details,
         },
         warnings=[
@@ -143,6 +143,7 @@ def write_posed(
             *warnings,
             *move.warnings,
             *depths.warnings,
+            *common.warnings(),
         ],
         points=None if capture.points is None else _points(capture.points, move),
     )

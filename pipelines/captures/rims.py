@@ -11,7 +11,6 @@ pictures are black nowhere else: a thing before black cloth has no rim.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -21,7 +20,7 @@ import PIL.Image
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
-from pipelines.captures.pictures import Picture, evenly_picked
+from pipelines.captures.pictures import evenly_picked
 from pipelines.stage import StageContext
 
 Bools = NDArray[np.bool_]
@@ -41,36 +40,14 @@ _GROWN_PX = 2
 """Pixels beside a rim are mixed with it."""
 
 
-def mask_rims(out: Path, pictures: Sequence[Picture], ctx: StageContext) -> dict[str, str]:
-    """Masks written for pictures with a black rim: by the picture's file, the mask's below `out`.
-
-    pictures: as written below `out`, without masks of their own.
-    """
-    sizes: dict[tuple[int, int], list[Picture]] = defaultdict(list)
-    for picture in pictures:
-        sizes[picture.width, picture.height].append(picture)
-    found: dict[str, str] = {}
-    for alike in sizes.values():
-        if len(alike) < _LEAST_PICTURES:
-            continue
-        picked = [alike[index] for index in evenly_picked(len(alike), _MOST_PICTURES)]
-        rim = common_rim([out / picture.file for picture in picked], ctx)
-        if rim is None:
-            continue
-        (out / "masks").mkdir(exist_ok=True)
-        mask = PIL.Image.fromarray(np.where(rim, np.uint8(0), np.uint8(255)))
-        for picture in alike:
-            found[picture.file] = f"masks/{Path(picture.file).stem}.png"
-            mask.save(out / found[picture.file])
-    return found
-
-
 def common_rim(files: Sequence[Path], ctx: StageContext) -> Bools | None:
     """The rim [H, W] that pictures of one size have in common, and pixels mixed with it; None
-    without one."""
+    without one, and of few pictures. Raises Cancelled."""
+    if len(files) < _LEAST_PICTURES:
+        return None
     common: Bools | None = None
     shares = []
-    for file in files:
+    for file in [files[index] for index in evenly_picked(len(files), _MOST_PICTURES)]:
         ctx.check_cancelled()
         with PIL.Image.open(file) as opened:
             black = np.asarray(opened.convert("RGB")).max(axis=2) <= _BLACK

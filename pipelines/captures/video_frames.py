@@ -6,12 +6,14 @@ that are kept are written without another conversion of colours. Memory stays at
 
 from __future__ import annotations
 
+import math
 import queue
 import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -69,6 +71,29 @@ class Frame:
         picture.save(path, "JPEG", quality=quality, subsampling=2)
 
 
+class Crop(NamedTuple):
+    """A part of a picture, in its pixels."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    def enlarged(self, size: tuple[int, int], whole: tuple[int, int]) -> Crop:
+        """The same part of a picture of size `whole` that had been reduced to `size`; none of what
+        lies beside it is in there."""
+        across, down = whole[0] / size[0], whole[1] / size[1]
+        left, top = math.ceil(self.x * across), math.ceil(self.y * down)
+        right = min(math.floor((self.x + self.width) * across), whole[0])
+        bottom = min(math.floor((self.y + self.height) * down), whole[1])
+        return Crop(left, top, right - left, bottom - top)
+
+
 @dataclass(frozen=True)
 class DecodePlan:
     """What is decoded.
@@ -76,6 +101,7 @@ class DecodePlan:
     width, height: of the upright, reduced frames. hdr: as in `VideoInfo`. matrix: ffmpeg's name of
     the colour matrix to assume, or None for the one that the video names.
     step_s: at most one frame is delivered per cell of this length (from `start_s` on); 0 for all.
+    crop: the part of the upright, unreduced frames that is taken; None for all.
     """
 
     width: int
@@ -84,6 +110,7 @@ class DecodePlan:
     matrix: str | None = None
     start_s: float = 0.0
     step_s: float = 0.0
+    crop: Crop | None = None
 
 
 def reduced_size(width: int, height: int, long_side_px: int) -> tuple[int, int]:
@@ -105,6 +132,9 @@ def filter_chain(plan: DecodePlan, pq_table: Path | None = None) -> str:
     parts.append("showinfo@kept=checksum=0")
     if plan.matrix is not None:
         parts.append(f"setparams=colorspace={plan.matrix}")
+    if plan.crop is not None:
+        x, y, width, height = plan.crop
+        parts.append(f"crop={width}:{height}:{x}:{y}:exact=1")
     parts.append(f"scale={plan.width}:{plan.height}:flags=bicubic+accurate_rnd")
     if plan.hdr in TRANSFERS:
         parts += sdr_filters(plan.hdr, pq_table)

@@ -115,6 +115,7 @@ def read_source(workspace: Workspace) -> Source:
         files = tuple(str(frame["file"]) for frame in frames)
         times = tuple(_seconds(frame["timestamp_s"]) for frame in frames)
         clips = tuple(int(frame.get("clip", 0)) for frame in frames)
+        masks = tuple(frame.get("mask") for frame in frames)
         source = Source(
             root,
             files,
@@ -123,6 +124,7 @@ def read_source(workspace: Workspace) -> Source:
             clips=clips,
             views=_views(frames),
             clip_names=names,
+            masks=masks if any(masks) else (),
         )
     else:
         capture = json.loads((root / "capture.json").read_text("utf-8"))

@@ -3,12 +3,16 @@ where the picture moves far meanwhile.
 
 Writes `images/frame_00001.jpg`, ... (upright, SDR, reduced) and `frames.json`: `{width, height,
 num_source_frames, warnings, clips: [{name, offset_s, duration_s, width, height, num_frames,
-num_source_frames}], frames: [{file, clip, timestamp_s, source_frame_index, sharpness, speed,
-gain_ev}]}`. Frames of a 360-degree clip lie in `panoramas/`, and the views cut from each in
-`images/`: its row lists them as `views`. Times of several clips run on from one to the next:
-`offset_s` is where a clip's own begin. speed: how fast the picture moved in the frame's window, the
-median, long sides per second, or null. gain_ev: stops by which exposure changed since the clip's
-first frame, as far as that was seen. Each clip is decoded once; of each window only the best frame
+num_source_frames, crop, burned_in}], frames: [{file, clip, timestamp_s, source_frame_index,
+sharpness, speed, gain_ev}]}`. Frames of a 360-degree clip lie in `panoramas/`, and the views cut
+from each in `images/`: its row lists them as `views`. Times of several clips run on from one to the
+next: `offset_s` is where a clip's own begin. speed: how fast the picture moved in the frame's
+window, the median, long sides per second, or null. gain_ev: stops by which exposure changed since
+the clip's first frame, as far as that was seen. crop: where bars beside a clip were cut away, what
+was left of its upright pictures, [x, y, width, height], else null. burned_in: the share of its
+frames that something else was laid over; rows then name each frame's `mask`, black there.
+
+Each clip is decoded once, and again without its bars; of each window only the best frame
 so far of each of its SLOTS is held.
 """
 
@@ -19,12 +23,14 @@ import math
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pipelines.captures.archive_rules import shown
+from pipelines.captures.burned_in import find_burned_in
 from pipelines.captures.clips import Clip, clip_file
+from pipelines.captures.common_parts import burned_in_warning, write_mask
 from pipelines.captures.hdr import TRANSFERS
 from pipelines.captures.minimum import MIN_IMAGES
 from pipelines.captures.motion import MotionMeter
@@ -32,6 +38,7 @@ from pipelines.captures.panorama_files import FOLDER as PANORAMAS
 from pipelines.captures.panorama_files import write_views
 from pipelines.captures.record import CaptureRecord
 from pipelines.captures.video_frames import (
+    Crop,
     DecodePlan,
     Frame,
     decode,
@@ -249,13 +256,14 @@ class _Scale:
 
 @dataclass(frozen=True)
 class _Read:
-    """What came of a clip."""
+    """What came of a clip. burned_in: the share of its frames that is masked."""
 
     plan: DecodePlan
     offset_s: float
     num_decoded: int
     num_seen: int
     num_kept: int
+    burned_in: float = 0.0
 
 
 def _read_clip(
@@ -266,10 +274,46 @@ def _read_clip(
     options: FramesOptions,
     scale: _Scale,
 ) -> _Read:
-    """Decode a clip and add its best frames to the rows. share: how many."""
+    """Add a clip's best frames to the rows, without bars, and with masks of what else lies over
+    them. share: how many."""
+    num_before = len(rows)
+    read = _decode_clip(clip, number, share, rows, options, scale)
+    if not options.find_burned_in or clip.num_views:
+        return read
+    ctx, plan, own = scale.ctx, read.plan, rows[num_before:]
+    found = find_burned_in([ctx.out / row["file"] for row in own], ctx)
+    if found is None:
+        return read
+    if found.crop is not None:
+        for row in own:
+            (ctx.out / row["file"]).unlink()
+        del rows[num_before:]
+        whole = (clip.video["width"], clip.video["height"])
+        crop = found.crop.enlarged((plan.width, plan.height), whole)
+        read = _decode_clip(clip, number, share, rows, options, scale, crop)
+        own = rows[num_before:]
+        found = find_burned_in([ctx.out / row["file"] for row in own], ctx)
+    if found is None:
+        return read
+    for row in own:
+        row["mask"] = write_mask(ctx.out, row["file"], found.mask)
+    return replace(read, burned_in=found.share)
+
+
+def _decode_clip(
+    clip: Clip,
+    number: int,
+    share: int,
+    rows: list[dict[str, Any]],
+    options: FramesOptions,
+    scale: _Scale,
+    crop: Crop | None = None,
+) -> _Read:
+    """Decode a clip, or a part of its pictures, and add its best frames to the rows."""
     ctx = scale.ctx
     long_side_px = options.long_side_px * (PANORAMA_SIZE if clip.num_views else 1)
-    width, height = reduced_size(clip.video["width"], clip.video["height"], long_side_px)
+    taken = crop or Crop(0, 0, clip.video["width"], clip.video["height"])
+    width, height = reduced_size(taken.width, taken.height, long_side_px)
     windows = _Windows(
         out=ctx.out,
         jpeg_quality=options.jpeg_quality,
@@ -289,6 +333,7 @@ def _read_clip(
         matrix=clip.video.get("matrix"),
         start_s=clip.start_s,
         step_s=_step(clip, share * options.candidates_per_frame),
+        crop=crop,
     )
 
     def on_frame(frame: Frame) -> None:
@@ -322,12 +367,28 @@ def _check(rows: list[dict[str, Any]], clips: Sequence[Clip], read: Sequence[_Re
             hint="Film for 10 seconds or more, moving around the subject.",
         )
     return [
-        f"{one.num_decoded} of {clip.num_frames} frames"
-        + (f' of "{shown(clip.name)}"' if len(clips) > 1 else "")
-        + " could be decoded; the video is damaged."
+        warning
         for clip, one in zip(clips, read, strict=True)
-        if one.num_decoded < 0.9 * clip.num_frames
+        for warning in _warnings(clip, one, f' of "{shown(clip.name)}"' if len(clips) > 1 else "")
     ]
+
+
+def _warnings(clip: Clip, read: _Read, where: str) -> list[str]:
+    """What the sender should know of a clip. where: of which, if there are several."""
+    warnings = []
+    if read.num_decoded < 0.9 * clip.num_frames:
+        warnings.append(
+            f"{read.num_decoded} of {clip.num_frames} frames{where} could be decoded; the video is "
+            "damaged."
+        )
+    if read.plan.crop is not None:
+        left = math.prod(read.plan.crop.size) / (clip.video["width"] * clip.video["height"])
+        warnings.append(
+            f"Bars beside the pictures{where}, {1 - left:.0%} of the frame, were cut away."
+        )
+    if read.burned_in:
+        warnings.append(burned_in_warning(read.burned_in, where))
+    return warnings
 
 
 def _write(
@@ -351,6 +412,8 @@ def _write(
                 "height": one.plan.height,
                 "num_frames": one.num_kept,
                 "num_source_frames": one.num_decoded,
+                "crop": one.plan.crop and list(one.plan.crop),
+                "burned_in": round(one.burned_in, 4),
             }
             for clip, one in zip(clips, read, strict=True)
         ],

@@ -396,3 +396,43 @@ def test_a_quick_clip_gives_all_it_has_and_none_twice(tmp_path: Path) -> None:
     indices = [row["source_frame_index"] for row in rows]
     assert indices == sorted(set(indices))
     assert len(rows) == 60
+
+
+def test_bars_are_cut_away_and_a_logo_is_masked(tmp_path: Path) -> None:
+    """Of a film that is turned by its display matrix: what is cut is of the upright picture."""
+    plain = panned(tmp_path, (0.4, 0.4, 0.4))
+    logo = PIL.Image.new("RGB", (40, 40), "white")
+    logo.paste((0, 0, 0), (8, 16, 32, 24))
+    logo.save(tmp_path / "logo.png")
+    framed = tmp_path / "framed.mp4"
+    ffmpeg(
+        "-i", plain, "-i", tmp_path / "logo.png",
+        "-filter_complex", "[0][1]overlay=20:120,pad=640:180:80:0:0x305070,transpose=clock",
+        "-pix_fmt", "yuv420p", framed,
+    )  # fmt: skip
+    clip = tmp_path / "b.mp4"
+    rotated(framed, clip, -90)
+    ingested(tmp_path, clip)
+    summary, rows, out = chosen(tmp_path, num_frames=20)
+    (read,) = json.loads((out / "frames.json").read_text())["clips"]
+    assert read["crop"] == pytest.approx([80, 0, 320, 180], abs=6)
+    assert (summary["width"], summary["height"]) == tuple(read["crop"][2:])
+    assert read["burned_in"] == pytest.approx(40 * 40 / (320 * 180), abs=0.02)
+    assert [warning.split()[0] for warning in summary["warnings"]] == ["Bars", "Something"]
+    left = 80 - read["crop"][0]
+    for row in rows:
+        with PIL.Image.open(out / row["mask"]) as mask, PIL.Image.open(out / row["file"]) as image:
+            assert mask.size == image.size == (summary["width"], summary["height"])
+            hidden = np.asarray(mask) < 128
+        assert hidden[121:159, left + 21 : left + 59].all()
+        assert hidden.mean() < 0.06
+
+
+def test_bars_and_logos_can_be_left(tmp_path: Path) -> None:
+    plain, framed = panned(tmp_path, (0.4, 0.4)), tmp_path / "framed.mp4"
+    ffmpeg("-i", plain, "-vf", "pad=640:180:160:0", "-pix_fmt", "yuv420p", framed)
+    ingested(tmp_path, framed)
+    summary, rows, out = chosen(tmp_path, num_frames=16, find_burned_in=False)
+    assert (summary["width"], summary["warnings"]) == (640, [])
+    assert not any("mask" in row for row in rows)
+    assert not (out / "masks").exists()
