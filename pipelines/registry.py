@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=20,
+        version=21,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",

@@ -29,6 +29,7 @@ import numpy.typing as npt
 
 from pipelines.scene.focus import find_focus
 from pipelines.scene.pitch import level_with_planes
+from pipelines.scene.straightening import straightened
 
 Array = npt.NDArray[np.float64]
 
@@ -53,6 +54,8 @@ _ALL_ROUND_DEG = 200.0
 _MANY_UPSIDE_DOWN = 0.25
 """Share of cameras, their X axes parallel, that are upside down against the others where a drone
 flies to and fro; fewer are pictures of a wall that lost how they were held."""
+_TOLD_BY_HANDS = ("vertical", "sideways", "either_way")
+"""What is as exact as people hold their cameras level."""
 _MIN_SIGN = 0.1
 """A mean camera axis this short along the vertical says nothing about which end is up."""
 
@@ -86,11 +89,13 @@ class Normalisation:
     planes, camera_up or none.
 
     centered_on: focus (the point that the cameras look at) or centers (their mean).
+    straightened_deg: by how much up was turned to what is level in the scene.
     """
 
     similarity: Similarity
     up_from: str
     centered_on: str
+    straightened_deg: float = 0.0
 
 
 def opengl_from_opencv(world_from_camera_opencv: Array) -> Array:
@@ -288,19 +293,24 @@ def normalise(
     """The similarity that puts a reconstruction of unknown frame and scale into ours.
 
     world_from_camera: [N, 3, 4], OpenGL axes. measured: as in `find_up`. points: [P, 3], what they
-    see, asked where the cameras only tell what is level. Afterwards gravity points along -Z (if
+    see, asked where the cameras only tell what is level, and for what is level in the scene where
+    hands tell. Afterwards gravity points along -Z (if
     `orient`), the origin is the focus, or else the mean of the camera centres, and the
     largest absolute coordinate of a camera centre is 1. Cameras in one single point keep their
     scale.
     """
-    up, up_from = np.array([0.0, 0.0, 1.0]), "none"
+    up, up_from, turned_deg = np.array([0.0, 0.0, 1.0]), "none", 0.0
     if orient:
         up, up_from = find_up(world_from_camera, measured)
-        if up_from == "camera_up" and points is not None:
-            side = np.linalg.svd(world_from_camera[:, :, 0], full_matrices=False)[2][0]
-            by_planes = level_with_planes(points, world_from_camera[:, :, 3], side, up)
-            if by_planes is not None:
-                up, up_from = by_planes, "planes"
+    if points is not None and up_from == "camera_up":
+        side = np.linalg.svd(world_from_camera[:, :, 0], full_matrices=False)[2][0]
+        by_planes = level_with_planes(points, world_from_camera[:, :, 3], side, up)
+        if by_planes is not None:
+            up, up_from = by_planes, "planes"
+    elif points is not None and up_from in _TOLD_BY_HANDS:
+        level = straightened(points, world_from_camera, up)
+        if level is not None:
+            up, turned_deg = level, float(np.degrees(np.arccos(np.clip(level @ up, -1.0, 1.0))))
     rotation = rotation_to_z(up)
     focus = find_focus(world_from_camera)
     centers = world_from_camera[:, :, 3]
@@ -308,4 +318,5 @@ def normalise(
     reach = float(np.abs((centers - center) @ rotation.T).max(initial=0.0))
     scale = 1.0 / reach if reach > 1e-12 else 1.0
     similarity = Similarity(rotation=rotation, translation=-scale * rotation @ center, scale=scale)
-    return Normalisation(similarity, up_from, "centers" if focus is None else "focus")
+    centered_on = "centers" if focus is None else "focus"
+    return Normalisation(similarity, up_from, centered_on, turned_deg)

@@ -21,13 +21,13 @@ _MOST_DEG, _STEP_DEG = 40.0, 1.0
 """How far from the cameras' own up it may be; from 45 on a table looks like a wall."""
 _FINER, _PEAK = 9, 8
 """The best is the mean of so many angles around it, by this power of what lies on lines."""
-_LINE, _LINES = 0.01, 3
+LINE, _LINES = 0.01, 3
 """Width of a line, in median distances of points from the cameras' middle, and how many count."""
-_FEWEST_POINTS = 100
+FEWEST_POINTS = 100
 _LEAST_SHARE, _CLEAR = 0.2, 1.25
 """Of the points, how many lie on these lines, and how many times as many as by the median angle:
 of a hedge or a heap no direction has more than another."""
-_FARTHEST = 5.0
+FARTHEST = 5.0
 """Median distances beyond which points do not count: they are off by more than lines are wide."""
 
 
@@ -37,24 +37,24 @@ def level_with_planes(points: Array, eyes: Array, side: Array, up: Array) -> Arr
 
     points: [P, 3]. eyes: [N, 3], camera centres. side, up: [3] unit, orthogonal.
     """
-    if len(points) < _FEWEST_POINTS:
+    if len(points) < FEWEST_POINTS:
         return None
     away = points - eyes.mean(axis=0)
     distance = np.linalg.norm(away, axis=1)
     usual = float(np.median(distance))
     if not usual > 0.0:
         return None
-    away = away[distance <= _FARTHEST * usual]
+    away = away[distance <= FARTHEST * usual]
     flat = np.stack([away @ up, away @ np.cross(side, up)], axis=1)
     angles = np.radians(np.arange(-_MOST_DEG, _MOST_DEG + _STEP_DEG, _STEP_DEG))
-    shares = np.array([_on_lines(flat, angle, _LINE * usual) for angle in angles])
+    shares = np.array([_on_lines(flat, angle, LINE * usual) for angle in angles])
     best = int(shares.argmax())
     if not 0 < best < len(angles) - 1:
         return None
     if shares[best] < _LEAST_SHARE or shares[best] < _CLEAR * np.median(shares):
         return None
     near = angles[best] + np.radians(_STEP_DEG) * np.linspace(-1.0, 1.0, _FINER)
-    weights = np.array([_on_lines(flat, angle, _LINE * usual) for angle in near]) ** _PEAK
+    weights = np.array([_on_lines(flat, angle, LINE * usual) for angle in near]) ** _PEAK
     angle = float(np.average(near, weights=weights))
     level: Array = np.cos(angle) * up + np.sin(angle) * np.cross(side, up)
     return level
@@ -65,12 +65,12 @@ def _on_lines(flat: Array, angle: float, width: float) -> float:
     turned by an angle, and what is across it."""
     turned_up = flat @ [np.cos(angle), np.sin(angle)]
     across = flat @ [-np.sin(angle), np.cos(angle)]
-    return sum(_fullest(offsets, width) for offsets in (turned_up, across)) / len(flat)
+    return sum(share_on_lines(offsets, width) for offsets in (turned_up, across))
 
 
-def _fullest(offsets: Array, width: float) -> float:
-    """How many offsets lie in the fullest stretches of a width, less what evenly spread ones would
-    have there."""
+def share_on_lines(offsets: Array, width: float) -> float:
+    """The share of offsets [P] in their fullest stretches of a width, less what evenly spread ones
+    would have there."""
     bins = np.floor((offsets - offsets.min()) / width).astype(np.int64)
     counts = np.bincount(bins)
     if len(counts) <= 2 * _LINES:
@@ -81,4 +81,4 @@ def _fullest(offsets: Array, width: float) -> float:
         at = int(pairs.argmax())
         found += max(float(pairs[at]) - even, 0.0)
         pairs[max(at - 1, 0) : at + 2] = 0
-    return found
+    return found / len(offsets)

@@ -165,9 +165,11 @@ def _found(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         poses,
         orient=options.orientation == "auto",
         measured=found.up,
-        points=model.points,
+        points=model.points[model.track_lengths >= MIN_TRACK],
     )
-    notes = {"up_from": world.up_from, "centered_on": world.centered_on}
+    notes: dict[str, Any] = {"up_from": world.up_from, "centered_on": world.centered_on}
+    if world.straightened_deg:
+        notes["straightened_deg"] = round(world.straightened_deg, 2)
     write_cameras(ctx.out / "cameras.json", found, world, notes)
     write_sparse_points(ctx.out / SPARSE_POINTS, model, world)
     report = {
