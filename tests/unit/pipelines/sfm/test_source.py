@@ -195,6 +195,21 @@ def test_the_frames_of_each_clip_are_a_lens_and_a_sequence_of_their_own(tmp_path
     assert [group.indices for group in camera_groups(source, "RADIAL")] == [(0, 1), (2, 3, 4)]
 
 
+def test_frames_of_a_clip_that_something_lies_over_have_masks(tmp_path: Path) -> None:
+    folder = tmp_path / "frames" / "images"
+    folder.mkdir(parents=True)
+    rows: list[dict[str, Any]] = []
+    for number in range(4):
+        Image.new("RGB", (8, 8)).save(folder / f"{number}.jpg")
+        rows.append({"file": f"images/{number}.jpg", "timestamp_s": number / 10, "clip": 0})
+    rows[2]["mask"] = "masks/2.png"
+    (tmp_path / "frames" / "frames.json").write_text(json.dumps({"frames": rows}), "utf-8")
+    (tmp_path / "frames" / "manifest.json").write_text("{}", "utf-8")
+    source = read_source(Workspace(tmp_path))
+    assert source.masks == (None, None, "masks/2.png", None)
+    assert source.mask_paths == {2: tmp_path / "frames" / "masks/2.png"}
+
+
 @pytest.mark.captures
 @pytest.mark.skipif(
     "NERFWORKS_CAPTURES" not in os.environ,
