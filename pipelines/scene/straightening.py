@@ -23,7 +23,7 @@ _ASLANT_DEG, _MOST_DEG = 4.5, 15.0
 the most that is looked for of any."""
 _STEP_DEG, _FINER, _PEAK = 1.0, 7, 8
 """Of the grid of directions; the best is the mean of so many squared around it, by this power."""
-_LEAST_SHARE, _CLEAR, _BETTER = 0.2, 1.5, 1.15
+_LEAST_SHARE, _CLEAR, _BETTER = 0.2, 1.5, 1.05
 """Of the points, how many lie on few planes; how many times as many as in the median of the
 directions; and as by the direction that cameras tell."""
 _MOST_POINTS = 20_000
