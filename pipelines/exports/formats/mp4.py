@@ -1,8 +1,9 @@
 """Pictures in, an MP4 out: H.264, HEVC or AV1, written while the pictures are being made.
 
-yuv420p with even sides, BT.709 tags, `+faststart` (the index comes first). HEVC is tagged `hvc1`,
-as Apple's players want it. ffmpeg is fed through a
-pipe by a thread of its own, so that encoding runs beside rendering.
+yuv420p with even sides, `+faststart` (the index comes first). Matrix, primaries and transfer are
+tagged BT.709, in the stream and in the container (`colr`): players guess what is not. HEVC is
+tagged `hvc1`, as Apple's players want it. ffmpeg is fed through a pipe by a thread of its own, so
+that encoding runs beside rendering.
 """
 
 from __future__ import annotations
@@ -25,6 +26,11 @@ from pipelines.tools.process import Program
 _WAITING_FRAMES = 8
 _CLOSE_LIMIT_S = 300.0
 _POLL_S = 0.5
+_TAGGED = (
+    "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primaries=bt709:color_trc=bt709"
+)
+"""What each frame says of its colours overrules what is asked of the encoder: raw pictures say
+nothing of primaries and transfer, and so would the file."""
 _CODECS: dict[str, dict[str, str]] = {
     "h264": {"vcodec": "libx264", "preset": "medium"},
     "hevc": {
@@ -71,7 +77,7 @@ class VideoWriter:
             str(path),
             pix_fmt="yuv420p",
             crf=crf,
-            vf="scale=out_color_matrix=bt709:out_range=tv",
+            vf=_TAGGED,
             colorspace="bt709",
             color_primaries="bt709",
             color_trc="bt709",

@@ -82,7 +82,7 @@ def run(scene: TrainedScene, options: MeshVideoOptions, ctx: StageContext) -> di
 
 EXPORT = Export(
     kind="meshvideo",
-    version=5,
+    version=6,
     reads=("mesh",),
     run=run,
     options=MeshVideoOptions,

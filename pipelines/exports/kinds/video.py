@@ -141,7 +141,7 @@ _PLAYER = "any browser or player"
 
 EXPORT = Export(
     kind="video",
-    version=9,
+    version=10,
     reads=("mesh",),
     run=run,
     options=VideoOptions,

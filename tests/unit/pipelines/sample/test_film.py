@@ -71,7 +71,7 @@ def test_the_file_is_sideways_with_a_flag_and_plays_upright(tmp_path: Path) -> N
     truth = film_capture(path, 5, 320, on_frame=lambda done, total: seen.append((done, total)))
     described = _describe(path)
     assert "h264" in described
-    assert "yuv420p(tv, bt709" in described
+    assert re.search(r"yuv420p\(tv, bt709[,)]", described), "matrix, primaries and transfer"
     assert re.search(r"\b320x180\b", described)
     assert "rotation of -90.00 degrees" in described
     assert "30 fps" in described

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -25,8 +26,8 @@ def frame(index: int) -> np.ndarray:
     return picture
 
 
-def record(path: Path, cancel: bool = False) -> None:
-    with VideoWriter(path, WIDTH, HEIGHT, 24.0, 18) as writer:
+def record(path: Path, cancel: bool = False, codec: str = "h264") -> None:
+    with VideoWriter(path, WIDTH, HEIGHT, 24.0, 18, codec) as writer:
         for index in range(FRAMES):
             writer.write(frame(index))
         if cancel:
@@ -58,6 +59,18 @@ def test_colors_survive(video: Path) -> None:
     first = np.frombuffer(next(reader), np.uint8).reshape(HEIGHT, WIDTH, 3).astype(int)
     reader.close()
     assert np.abs(first.reshape(-1, 3).mean(0) - [200, 20, 90]).max() < 4
+
+
+@pytest.mark.parametrize("codec", ["h264", "hevc", "av1"])
+def test_matrix_primaries_and_transfer_are_tagged_in_stream_and_container(
+    tmp_path: Path, codec: str
+) -> None:
+    record(tmp_path / "video.mp4", codec=codec)
+    # ffmpeg says "bt709/unknown/unknown" where the matrix alone is known.
+    assert probe(tmp_path / "video.mp4").color.split(", ")[:2] == ["tv", "bt709"]
+    data = (tmp_path / "video.mp4").read_bytes()
+    kind, *tags, full_range = struct.unpack_from(">4s3HB", data, data.index(b"colr") + 4)
+    assert (kind, tags, full_range >> 7) == (b"nclx", [1, 1, 1], 0)
 
 
 def test_a_cancel_in_the_middle_leaves_no_file(tmp_path: Path) -> None:
