@@ -32,16 +32,20 @@ _TAGGED = (
 """What each frame says of its colours overrules what is asked of the encoder: raw pictures say
 nothing of primaries and transfer, and so would the file."""
 _CODECS: dict[str, dict[str, str]] = {
-    "h264": {"vcodec": "libx264", "preset": "medium"},
+    "h264": {"vcodec": "libx264", "preset": "medium", "x264-params": "threads=6"},
     "hevc": {
         "vcodec": "libx265",
         "preset": "medium",
         "tag:v": "hvc1",
-        "x265-params": "log-level=warning",
+        "x265-params": "log-level=warning:pools=6:frame-threads=2",
     },
     "av1": {"vcodec": "libsvtav1", "preset": "8"},
 }
-"""ffmpeg's options of each."""
+"""ffmpeg's options of each.
+
+How many frames x264 and x265 work on at once changes what they find, so that the number is the same
+on every machine, not that of its cores. SVT-AV1 writes the same whatever it is.
+"""
 
 
 class VideoWriter:

@@ -34,6 +34,14 @@ def record(path: Path, cancel: bool = False, codec: str = "h264") -> None:
             raise Cancelled("The job was cancelled.")
 
 
+def record_motion(path: Path, codec: str, frames: int, fps: float = 24.0) -> None:
+    """Large enough that x264 would use more than one thread."""
+    picture = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
+    with VideoWriter(path, 320, 240, fps, 18, codec) as writer:
+        for index in range(frames):
+            writer.write(np.roll(picture, 3 * index, axis=1) // 2 + np.uint8(index % 100))
+
+
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("video") / "video.mp4"
@@ -71,6 +79,23 @@ def test_matrix_primaries_and_transfer_are_tagged_in_stream_and_container(
     data = (tmp_path / "video.mp4").read_bytes()
     kind, *tags, full_range = struct.unpack_from(">4s3HB", data, data.index(b"colr") + 4)
     assert (kind, tags, full_range >> 7) == (b"nclx", [1, 1, 1], 0)
+
+
+@pytest.mark.parametrize("codec", ["h264", "hevc", "av1"])
+def test_the_bytes_do_not_depend_on_the_number_of_cores(tmp_path: Path, codec: str) -> None:
+    cores = os.sched_getaffinity(0)
+    written = []
+    try:
+        for some in ({min(cores)}, cores):
+            os.sched_setaffinity(0, some)  # ffmpeg inherits it
+            record_motion(tmp_path / "video.mp4", codec, frames=12)
+            written.append((tmp_path / "video.mp4").read_bytes())
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert written[0] == written[1]
+    # x265 asks the machine and not the process, so what both say of themselves counts, too.
+    told = {"h264": [b"threads=6 "], "hevc": [b"frame-threads=2 ", b"numa-pools=6 "], "av1": []}
+    assert all(words in written[0] for words in told[codec])
 
 
 def test_a_cancel_in_the_middle_leaves_no_file(tmp_path: Path) -> None:
