@@ -2,8 +2,9 @@
 
 yuv420p with even sides, `+faststart` (the index comes first). Matrix, primaries and transfer are
 tagged BT.709, in the stream and in the container (`colr`): players guess what is not. HEVC is
-tagged `hvc1`, as Apple's players want it. ffmpeg is fed through a pipe by a thread of its own, so
-that encoding runs beside rendering.
+tagged `hvc1`, as Apple's players want it. There is a key frame each second at least: to show any
+moment, as where somebody scrubs, a player decodes all since the last one. ffmpeg is fed through a
+pipe by a thread of its own, so that encoding runs beside rendering.
 """
 
 from __future__ import annotations
@@ -31,13 +32,14 @@ _TAGGED = (
 )
 """What each frame says of its colours overrules what is asked of the encoder: raw pictures say
 nothing of primaries and transfer, and so would the file."""
+_LEAST_BETWEEN_KEY_FRAMES = 12
 _CODECS: dict[str, dict[str, str]] = {
     "h264": {"vcodec": "libx264", "preset": "medium", "x264-params": "threads=6"},
     "hevc": {
         "vcodec": "libx265",
         "preset": "medium",
         "tag:v": "hvc1",
-        "x265-params": "log-level=warning:pools=6:frame-threads=2",
+        "x265-params": "log-level=warning:pools=6:frame-threads=2:open-gop=0",
     },
     "av1": {"vcodec": "libsvtav1", "preset": "8"},
 }
@@ -81,6 +83,7 @@ class VideoWriter:
             str(path),
             pix_fmt="yuv420p",
             crf=crf,
+            g=max(round(fps), _LEAST_BETWEEN_KEY_FRAMES),
             vf=_TAGGED,
             colorspace="bt709",
             color_primaries="bt709",

@@ -98,6 +98,20 @@ def test_the_bytes_do_not_depend_on_the_number_of_cores(tmp_path: Path, codec: s
     assert all(words in written[0] for words in told[codec])
 
 
+@pytest.mark.parametrize("codec", ["h264", "hevc", "av1"])
+@pytest.mark.parametrize(("fps", "most"), [(24.0, 24), (29.97, 30), (2.0, 12)])
+def test_a_player_decodes_a_second_at_most_to_show_any_moment(
+    tmp_path: Path, codec: str, fps: float, most: int
+) -> None:
+    record_motion(tmp_path / "video.mp4", codec, frames=70, fps=fps)
+    data = (tmp_path / "video.mp4").read_bytes()
+    at = data.index(b"stss")
+    (count,) = struct.unpack_from(">I", data, at + 8)
+    starts = [*struct.unpack_from(f">{count}I", data, at + 12), 71]
+    assert starts[0] == 1
+    assert most // 2 <= max(np.diff(starts)) <= most
+
+
 def test_a_cancel_in_the_middle_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "video.mp4"
     with pytest.raises(Cancelled):
