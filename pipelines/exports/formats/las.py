@@ -3,13 +3,14 @@
 Positions are whole multiples of a step, a power of ten at most a millionth of the cloud's extent,
 from an offset near its middle; so coordinates of any size stay exact. Colours are 16-bit (the 8
 bits twice), normals extra dimensions `NormalX`, `NormalY`, `NormalZ`. A record of the file's own
-says its frame. The date is left out: the same cloud gives the same bytes.
+says its frame. The date is always the same one, since the same cloud gives the same bytes.
 
 Source: ASPRS, LAS Specification 1.2; laspy, lazrs.
 """
 
 from __future__ import annotations
 
+import datetime
 import math
 from pathlib import Path
 
@@ -23,6 +24,8 @@ Floats = NDArray[np.float64]
 
 _POINT_FORMAT = 2
 _FINEST = 1e-6
+_DATE = datetime.date(1980, 1, 1)
+"""That of our zip files, too. laspy writes today's where it is given none."""
 _NORMALS = ("NormalX", "NormalY", "NormalZ")
 _RECORD_ID = 1
 
@@ -36,7 +39,7 @@ def write_points(
     """
     positions, turned = frame.of_world(points), frame.of_world(normals)
     header = laspy.LasHeader(version="1.2", point_format=_POINT_FORMAT)
-    header.creation_date = None
+    header.creation_date = _DATE
     header.generating_software = "nerfworks"
     header.scales = np.full(3, _step(positions))
     header.offsets = np.round(positions.mean(axis=0))

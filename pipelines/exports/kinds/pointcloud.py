@@ -285,7 +285,7 @@ def _empty(why: str) -> ExportError:
 
 EXPORT = Export(
     kind="pointcloud",
-    version=15,
+    version=16,
     reads=("ingest", "frames", "depth", "mesh"),
     run=run,
     options=PointcloudOptions,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,6 +50,28 @@ def test_laz_is_smaller_and_both_are_the_same_bytes_again(tmp_path: Path) -> Non
     assert sizes["a.las"] == sizes["b.las"]
     assert sizes["a.laz"] == sizes["b.laz"]
     assert len(sizes["a.laz"]) < 0.9 * len(sizes["a.las"])
+
+
+def test_the_bytes_do_not_depend_on_the_day(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+    for day in (2, 3):
+        monkeypatch.setattr(laspy.header, "date", _day(day))
+        las.write_points(tmp_path / "a.las", POINTS, COLORS, NORMALS, Frame())
+        written.append((tmp_path / "a.las").read_bytes())
+    assert written[0] == written[1]
+
+
+def _day(number: int) -> type[datetime.date]:
+    """The calendar on a day of January 2026."""
+
+    class Day(datetime.date):
+        @classmethod
+        def today(cls) -> Day:
+            return cls(2026, 1, number)
+
+    return Day
 
 
 @pytest.mark.parametrize("points", [POINTS[:1], np.repeat(POINTS[:1], 3, axis=0)])
