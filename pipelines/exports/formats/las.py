@@ -3,7 +3,9 @@
 Positions are whole multiples of a step, a power of ten at most a millionth of the cloud's extent,
 from an offset near its middle; so coordinates of any size stay exact. Colours are 16-bit (the 8
 bits twice), normals extra dimensions `NormalX`, `NormalY`, `NormalZ`. A record of the file's own
-says its frame. The date is always the same one, since the same cloud gives the same bytes.
+says its frame. The date is always the same one, since the same cloud gives the same bytes. Each
+point is return 1 of 1, as of a scanner's pulse that met one thing: returns are counted from 1, and
+programs that show first or last returns pass over what is none.
 
 Source: ASPRS, LAS Specification 1.2; laspy, lazrs.
 """
@@ -50,6 +52,8 @@ def write_points(
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = positions.T
     cloud.red, cloud.green, cloud.blue = colors.astype(np.uint16).T * 257
+    cloud.return_number[:] = 1
+    cloud.number_of_returns[:] = 1
     for name, column in zip(_NORMALS, turned.T, strict=True):
         cloud[name] = column.astype(np.float32)
     cloud.write(str(path))

@@ -52,6 +52,15 @@ def test_laz_is_smaller_and_both_are_the_same_bytes_again(tmp_path: Path) -> Non
     assert len(sizes["a.laz"]) < 0.9 * len(sizes["a.las"])
 
 
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_each_point_is_the_only_return_of_its_pulse(tmp_path: Path, ending: str) -> None:
+    las.write_points(tmp_path / f"a.{ending}", POINTS, COLORS, NORMALS, Frame())
+    cloud = laspy.read(tmp_path / f"a.{ending}")
+    assert set(np.asarray(cloud.return_number)) == {1}
+    assert set(np.asarray(cloud.number_of_returns)) == {1}
+    assert cloud.header.number_of_points_by_return[:2].tolist() == [len(POINTS), 0]
+
+
 def test_the_bytes_do_not_depend_on_the_day(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
