@@ -90,6 +90,19 @@ def test_a_cloud_without_extent_is_written(tmp_path: Path, points: np.ndarray) -
     np.testing.assert_allclose(laspy.read(tmp_path / "a.las").xyz, points, atol=1e-5)
 
 
+@pytest.mark.parametrize("extent", [1e-7, 5e-4, 3e-3, 2.0, 900.0])
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (0.5, 0.5, 0.5), (-7.25, 0.5, 1234.5)])
+def test_a_cloud_of_any_extent_is_written_wherever_it_lies(
+    tmp_path: Path, extent: float, at: tuple[float, float, float]
+) -> None:
+    points = np.random.default_rng(1).uniform(0.0, extent, (200, 3)) + at
+    las.write_points(tmp_path / "a.las", points, COLORS[:200], NORMALS[:200], Frame())
+    cloud = laspy.read(tmp_path / "a.las")
+    np.testing.assert_allclose(cloud.xyz, points, rtol=1e-12, atol=1e-6 * extent)
+    if extent > 1.0:
+        np.testing.assert_array_equal(cloud.header.offsets, np.round(cloud.header.offsets))
+
+
 def test_text_has_a_line_for_each_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(xyz, "_ROWS", 700)
     path = tmp_path / "cloud.xyz"
