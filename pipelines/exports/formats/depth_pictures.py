@@ -43,6 +43,15 @@ def write_png(path: Path, z: NDArray[np.float32], unit: float) -> int:
     return int(beyond.sum())
 
 
+def as_seen(z: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    """Depths [H, W] as channels of OpenEXR: Z, as it is called there, and the same as a picture.
+
+    Blender, ffmpeg and picture viewers read colours alone: of a file that has Z and no more they
+    show black, or nothing. Compression makes little of a number that is there four times.
+    """
+    return {"R": z, "G": z, "B": z, "Z": z}
+
+
 def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]]) -> None:
     """Write channels [H, W] by their names."""
     # Large, and few jobs want it.

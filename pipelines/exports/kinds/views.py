@@ -3,7 +3,8 @@ the colours.
 
 Undistorted views of the trained scene from the corrected poses, `transforms.json` with their lenses
 and poses in nerfstudio's layout. Depth is z, along the camera's axis: 16-bit PNG in whole steps of
-a stated unit, and OpenEXR in world units. Normals are in the camera's axes (x right, y up, z to
+a stated unit, and OpenEXR in world units, as channel Z and as the three colours of a picture, which
+programs show that know no Z. Normals are in the camera's axes (x right, y up, z to
 the camera): a picture, and OpenEXR. 0 is unknown.
 """
 
@@ -196,7 +197,7 @@ def _write(
     if "depth" in options.contents and "png" in options.formats:
         beyond = depth_pictures.write_png(place("depth", "png"), view.z_depth, unit)
     if "depth" in options.contents and "exr" in options.formats:
-        depth_pictures.write_exr(place("depth", "exr"), {"Z": view.z_depth})
+        depth_pictures.write_exr(place("depth", "exr"), depth_pictures.as_seen(view.z_depth))
     if "normals" in options.contents:
         normals = shades.normals_of(view)
         if "png" in options.formats:
@@ -232,7 +233,7 @@ def _transforms(frames: list[dict[str, Any]], unit: float, scene: TrainedScene) 
         "camera_model": "PINHOLE",
         "orientation_override": "none",
         "frame": Frame(metric=scene.cameras.metric).note(),
-        "depth": "z along the camera's axis, 0 is unknown; EXR in the world's unit",
+        "depth": "z along the camera's axis, 0 is unknown; EXR in the world's unit, Z and colours",
         "depth_unit_scale_factor": unit,
         "normals": "in the camera's axes, x right, y up, z to the camera; 0 is unknown",
         "frames": frames,
@@ -242,7 +243,7 @@ def _transforms(frames: list[dict[str, Any]], unit: float, scene: TrainedScene) 
 
 EXPORT = Export(
     kind="views",
-    version=4,
+    version=5,
     reads=("mesh",),
     run=run,
     options=ViewsOptions,

@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import ffmpeg
 import numpy as np
 import OpenEXR
 import pytest
@@ -18,6 +19,7 @@ from pipelines.exports.formats import depth_pictures
 from pipelines.options import OptionsError, resolve_options
 from pipelines.scene.depth_views import Pinhole
 from pipelines.scene.trained_scene import TrainedScene
+from pipelines.tools.ffmpeg import run_ffmpeg
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.scene.synthetic_views import look_at, sphere_view
 from tests.unit.pipelines.stages import tiny_job
@@ -57,7 +59,10 @@ def test_every_view_is_there_in_all_formats_and_they_agree(job: Workspace, tmp_p
         with Image.open(io.BytesIO(files[frame["depth_file_path"]])) as picture:
             assert picture.mode == "I;16"
             steps = np.asarray(picture).astype(float)
-        exact = exr(files[frame["depth_file_path"].replace("png", "exr")], tmp_path)["Z"]
+        channels = exr(files[frame["depth_file_path"].replace("png", "exr")], tmp_path)
+        exact = channels["Z"]
+        for color in "RGB":
+            np.testing.assert_array_equal(channels[color], exact)
         np.testing.assert_allclose(exact, view.z_depth, rtol=1e-5)
         assert (steps > 0).mean() > 0.5
         fits = exact / unit < 65_535.5
@@ -102,6 +107,18 @@ def test_a_world_without_metres_has_steps_that_fit_and_says_so(
     assert summary["num_pixels_beyond_png"] == 0
     with zipfile.ZipFile(job.stage("views") / "views.zip") as archive:
         assert "length is unknown" in json.loads(archive.read("transforms.json"))["frame"]
+
+
+def test_depth_is_seen_by_programs_that_know_colours_alone(tmp_path: Path) -> None:
+    z = np.random.default_rng(0).uniform(0.1, 0.9, (48, 64)).astype(np.float32)
+    path = tmp_path / "depth.exr"
+    depth_pictures.write_exr(path, depth_pictures.as_seen(z))
+    # As Blender does, ffmpeg takes the colours of a picture, and none where there are none.
+    stream = ffmpeg.input(str(path)).output("pipe:", format="rawvideo", pix_fmt="gbrpf32le")
+    seen: list[bytes] = []
+    run_ffmpeg(stream, on_stdout=seen.append)
+    planes = np.frombuffer(b"".join(seen), "<f4").reshape(3, 48, 64)
+    np.testing.assert_array_equal(planes, np.broadcast_to(z, planes.shape))
 
 
 def test_depths_beyond_16_bits_are_unknown_and_counted_and_near_ones_are_known(
