@@ -200,7 +200,6 @@ def run(scene: TrainedScene, options: PointcloudOptions, ctx: StageContext) -> d
         cloud = skin.painted(cloud, on_mesh, told)
     told = ctx.told_part("estimating normals", 0.94, 0.97)
     cloud = clouds.with_normals(cloud, _NORMAL_NEIGHBOURS, told)
-    ctx.progress(0.97, "writing")
     _write(cloud, options, ctx, place, scene.cameras)
     return {
         "frame": place.as_dict(),
@@ -257,19 +256,25 @@ def _write(
     from pipelines.exports.formats.colmap import write_colmap_points
     from pipelines.exports.judged import JUDGED_CLOUD
 
+    told = ctx.told_part("writing", 0.97, 1.0)
     points, cameras = place.points(cloud.points), place.cameras(cameras)
     content = (points, cloud.colors, place.directions(cloud.normals), place.frame())
+
+    def told_of(name: Format) -> Callable[[float], None]:
+        begin = options.formats.index(name)
+        return lambda done: told((begin + done) / len(options.formats))
+
     writers: dict[Format, Callable[[Path], None]] = {
         "ply": lambda path: ply.write_points(path, *content),
         "las": lambda path: las.write_points(path, *content),
         "laz": lambda path: las.write_points(path, *content),
-        "xyz": lambda path: xyz.write_points(path, *content),
+        "xyz": lambda path: xyz.write_points(path, *content, told_of("xyz")),
         "colmap": lambda path: write_colmap_points(
             path, cameras, points, cloud.colors, place.frame()
         ),
     }
     for name in options.formats:
-        ctx.check_cancelled()
+        told_of(name)(0.0)
         writers[name](ctx.out / _FILES[name])
     if "ply" not in options.formats:
         writers["ply"](ctx.out / JUDGED_CLOUD)

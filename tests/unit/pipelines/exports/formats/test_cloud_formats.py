@@ -11,7 +11,8 @@ import numpy as np
 import open3d
 import pytest
 
-from pipelines.exports.formats import las, xyz
+from pipelines.errors import Cancelled
+from pipelines.exports.formats import las, numbers, xyz
 from pipelines.exports.frame import Frame
 
 RNG = np.random.default_rng(0)
@@ -104,7 +105,7 @@ def test_a_cloud_of_any_extent_is_written_wherever_it_lies(
 
 
 def test_text_has_a_line_for_each_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(xyz, "_ROWS", 700)
+    monkeypatch.setattr(numbers, "_ROWS", 700)
     path = tmp_path / "cloud.xyz"
     xyz.write_points(path, POINTS, COLORS, NORMALS, Frame())
     assert path.read_text().startswith("# x y z red green blue nx ny nz; right-handed, +Z up")
@@ -114,3 +115,19 @@ def test_text_has_a_line_for_each_point(tmp_path: Path, monkeypatch: pytest.Monk
     np.testing.assert_allclose(rows[:, 6:], NORMALS, atol=1e-5)
     read: Any = open3d.io.read_point_cloud(path)
     assert len(read.points) == len(POINTS)
+
+
+def test_text_tells_how_far_it_is_and_stops_where_it_is_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numbers, "_ROWS", 1000)
+    told: list[float] = []
+
+    def tell(done: float) -> None:
+        told.append(done)
+        if done >= 0.6:
+            raise Cancelled("The job was cancelled.")
+
+    with pytest.raises(Cancelled):
+        xyz.write_points(tmp_path / "cloud.xyz", POINTS, COLORS, NORMALS, Frame(), tell)
+    assert told == [0.2, 0.4, 0.6]
