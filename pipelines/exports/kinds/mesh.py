@@ -70,7 +70,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=31,
+    version=32,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,

@@ -14,6 +14,8 @@ import trimesh
 from pipelines.exports.formats import obj
 from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
+from pipelines.exports.surface.watertight import is_closed
+from pipelines.exports.texture.unwrap import unwrap
 from tests.unit.pipelines.exports.formats import solids
 
 
@@ -58,6 +60,41 @@ def test_a_mesh_without_a_picture_keeps_its_vertices_colours(tmp_path: Path) -> 
         np.testing.assert_allclose(np.asarray(values)[corners], wanted[solids.FACES], atol=1e-4)
     assert sorted(entry.name for entry in path.parent.iterdir()) == ["mesh.mtl", "mesh.obj"]
     assert "map_Kd" not in (path.parent / "mesh.mtl").read_text()
+
+
+def test_a_closed_surface_with_a_picture_stays_closed(tmp_path: Path) -> None:
+    """A ball, cut into charts for its picture, whose seams are in no index of a place."""
+    ball = trimesh.creation.icosphere(3)
+    faces = np.asarray(ball.faces, np.int32)
+    chart = unwrap(ball.vertices, faces, np.full(len(faces), 100.0), 1024)
+    assert len(chart.vertex) > 1.2 * len(ball.vertices), "there are seams"
+    picture = np.zeros((chart.side, chart.side, 3), np.uint8)
+    painted = TexturedMesh(
+        np.asarray(ball.vertices)[chart.vertex],
+        chart.faces,
+        np.asarray(ball.vertex_normals)[chart.vertex],
+        chart.uv / chart.side,
+        picture,
+    )
+    path = unpacked(tmp_path, painted)
+    lines = [line.split() for line in path.read_text().splitlines()]
+    places = np.array([words[1:] for words in lines if words[0] == "v"], float)
+    named = [[word.split("/") for word in words[1:]] for words in lines if words[0] == "f"]
+    corners = np.array(named, int) - 1
+    assert is_closed(corners[..., 0])
+    assert len(places) == len(ball.vertices)
+    np.testing.assert_allclose(places[corners[..., 0]], painted.vertices[painted.faces], atol=1e-8)
+    textures = np.array([words[1:] for words in lines if words[0] == "vt"], float)
+    wanted = painted.uv[painted.faces] * [1.0, -1.0] + [0.0, 1.0]
+    np.testing.assert_allclose(textures[corners[..., 1]], wanted, atol=1e-8)
+    normals = np.array([words[1:] for words in lines if words[0] == "vn"], float)
+    wanted = painted.normals[painted.faces]
+    np.testing.assert_allclose(normals[corners[..., 2]], wanted, atol=1e-6)
+    by_place: Any = trimesh.load_mesh(path, maintain_order=True, process=False)
+    assert len(by_place.faces) == len(faces)
+    read = open3d.io.read_triangle_mesh(path)
+    read.remove_duplicated_vertices()
+    assert read.is_watertight()
 
 
 def test_more_rows_than_are_written_at_once_are_all_there(
