@@ -108,21 +108,27 @@ def write_mesh(
 ) -> None:
     """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
     told = ctx.told_part("writing", _TEXTURE_SHARE, _SUBJECT_SHARE)
-    told(0.0)
     frame = place.frame(options.up_axis)
     mesh, skin = place.mesh(mesh), place.mesh(skin)
+    # A GLB is written in any case: what is delivered is judged by it.
+    wanted: tuple[Format, ...] = (*options.formats, "glb")
+    names = list(dict.fromkeys(wanted))
+
+    def told_of(name: Format) -> Callable[[float], None]:
+        begin = names.index(name)
+        return lambda done: told((begin + done) / len(names))
+
     writers: dict[Format, Callable[[Path], None]] = {
-        "glb": lambda path: glb.write_mesh(path, skin, frame, _style(options), told),
+        "glb": lambda path: glb.write_mesh(path, skin, frame, _style(options), told_of("glb")),
         "ply": lambda path: ply.write_mesh(path, mesh, frame),
-        "obj": lambda path: obj.write_mesh(path, skin, frame),
+        "obj": lambda path: obj.write_mesh(path, skin, frame, told_of("obj")),
         "stl": lambda path: stl.write_mesh(path, mesh, frame),
         "usdz": lambda path: usdz.write_mesh(path, skin, frame),
     }
-    for name in options.formats:
-        ctx.check_cancelled()
-        writers[name](ctx.out / _FILES[name])
-    if "glb" not in options.formats:
-        writers["glb"](ctx.out / JUDGED_MESH)
+    for name in names:
+        told_of(name)(0.0)
+        file = _FILES[name] if name in options.formats else JUDGED_MESH
+        writers[name](ctx.out / file)
 
 
 def write_subject(

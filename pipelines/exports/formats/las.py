@@ -76,4 +76,5 @@ def _offset(positions: Floats, step: float) -> Floats:
     if np.abs(positions - whole).max() / step < _MOST_STEPS:
         return whole
     digits = 1 - round(math.log10(step))
-    return np.round(middle, digits)
+    near: Floats = np.round(middle, digits)
+    return near

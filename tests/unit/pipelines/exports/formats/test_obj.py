@@ -11,7 +11,8 @@ import open3d
 import pytest
 import trimesh
 
-from pipelines.exports.formats import obj
+from pipelines.errors import Cancelled
+from pipelines.exports.formats import numbers, obj
 from pipelines.exports.frame import Frame
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh, unit_normals
 from pipelines.exports.surface.watertight import is_closed
@@ -100,10 +101,27 @@ def test_a_closed_surface_with_a_picture_stays_closed(tmp_path: Path) -> None:
 def test_more_rows_than_are_written_at_once_are_all_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(obj, "_ROWS", 3)
+    monkeypatch.setattr(numbers, "_ROWS", 3)
     mesh = trimesh.load_mesh(unpacked(tmp_path, solids.coloured()), process=False)
     assert mesh.vertices.shape == (4, 3)
     np.testing.assert_array_equal(mesh.faces, solids.FACES)
+
+
+def test_it_tells_how_far_it_is_and_stops_where_it_is_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numbers, "_ROWS", 2)
+    told: list[float] = []
+    obj.write_mesh(tmp_path / "mesh.obj.zip", solids.textured(), Frame(), told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    assert len(told) == 2 + 2 + 2 + 2 + 1, "places, their places in the picture, normals, faces"
+
+    def cancel(done: float) -> None:
+        raise Cancelled("The job was cancelled.")
+
+    with pytest.raises(Cancelled):
+        obj.write_mesh(tmp_path / "mesh.obj.zip", solids.textured(), Frame(), cancel)
 
 
 def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path) -> None:
