@@ -91,7 +91,7 @@ def write_levels(mesh: TriangleMesh, paint: Painter, place: Placement) -> list[d
         glb.write_mesh(
             path,
             place.mesh(coarse),
-            place.frame(options.up_axis),
+            place.frame(),
             _style(options),
             functools.partial(paint.tell_writing, level),
         )
@@ -108,7 +108,7 @@ def write_mesh(
 ) -> None:
     """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
     told = ctx.told_part("writing", _TEXTURE_SHARE, _SUBJECT_SHARE)
-    frame = place.frame(options.up_axis)
+    frames = {name: place.frame(options.up_in(name)) for name in _FILES}
     mesh, skin = place.mesh(mesh), place.mesh(skin)
     # A GLB is written in any case: what is delivered is judged by it.
     wanted: tuple[Format, ...] = (*options.formats, "glb")
@@ -119,11 +119,13 @@ def write_mesh(
         return lambda done: told((begin + done) / len(names))
 
     writers: dict[Format, Callable[[Path], None]] = {
-        "glb": lambda path: glb.write_mesh(path, skin, frame, _style(options), told_of("glb")),
-        "ply": lambda path: ply.write_mesh(path, mesh, frame),
-        "obj": lambda path: obj.write_mesh(path, skin, frame, told_of("obj")),
-        "stl": lambda path: stl.write_mesh(path, mesh, frame),
-        "usdz": lambda path: usdz.write_mesh(path, skin, frame),
+        "glb": lambda path: glb.write_mesh(
+            path, skin, frames["glb"], _style(options), told_of("glb")
+        ),
+        "ply": lambda path: ply.write_mesh(path, mesh, frames["ply"]),
+        "obj": lambda path: obj.write_mesh(path, skin, frames["obj"], told_of("obj")),
+        "stl": lambda path: stl.write_mesh(path, mesh, frames["stl"]),
+        "usdz": lambda path: usdz.write_mesh(path, skin, frames["usdz"]),
     }
     for name in names:
         told_of(name)(0.0)

@@ -22,9 +22,11 @@ class MeshOptions(CropOptions, TextureOptions):
         description="Files that are delivered: glb, ply, obj (a zip with its material and "
         "picture), stl, usdz.",
     )
-    up_axis: Axis = Field(
-        "z",
-        description="Which axis is up in ply, obj and stl. In glb and usdz it is always y.",
+    up_axis: Literal["auto", "z", "y"] = Field(
+        "auto",
+        description="Which axis is up in ply, obj and stl. auto is what programs take each format "
+        "for: y in obj, z in ply and stl; of frame=source all three keep the capture's own axes. "
+        "In glb and usdz it is always y.",
     )
 
     extent: Literal["auto", "subject", "scene"] = Field(
@@ -149,6 +151,12 @@ class MeshOptions(CropOptions, TextureOptions):
         "three.js and Babylon read it, with a transcoder to be switched on; other programs may not "
         "know it.",
     )
+
+    def up_in(self, format: Format) -> Axis:
+        """Which axis is up in the files of a format, where that is not the format's own matter."""
+        if self.up_axis != "auto":
+            return self.up_axis
+        return "y" if format == "obj" and self.frame != "source" else "z"
 
     @field_validator("formats")
     @classmethod

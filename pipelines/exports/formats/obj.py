@@ -5,6 +5,9 @@ colour behind its position (`v x y z r g b`, sRGB), which MeshLab, Blender and O
 coordinates of OBJ have their origin at the picture's bottom left. Places are told to a
 hundred-millionth of their extent, also in map coordinates.
 
+OBJ has no word for what is up. Blender, Unity and viewers take +Y for it, so that is the default of
+who asks for a mesh (`MeshOptions.up_in`); the first line tells which it is.
+
 Corners name place, texture coordinates and normal each by a number of its own. So a place is there
 once, though the picture has it once for each chart that meets there: what is one surface stays one
 for who prints, smooths or reduces it.

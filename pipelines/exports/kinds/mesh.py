@@ -1,7 +1,7 @@
 """The mesh: rendered depth fused into triangles, in the formats asked for.
 
 All of them lie in one frame, the world of cameras.json unless another is asked for
-(`pipelines.exports.frame`); GLB and USDZ have +Y up.
+(`pipelines.exports.frame`); GLB, USDZ and OBJ have +Y up.
 GLB, OBJ and USDZ have a texture from the training photos or the trained field, PLY the field's
 colours on its vertices, STL is shape alone.
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from pipelines.exports.mesh_options import Format, MeshOptions
 from pipelines.exports.options import RenderingOptions, render_config
 from pipelines.exports.requests import resolve_export
 from pipelines.nerf.options.render import RenderConfig
@@ -71,7 +72,7 @@ def test_an_export_has_exactly_the_formats_asked_for(
     [
         ("mesh", {"formats": []}, "at least 1"),
         ("mesh", {"formats": ["glb", "fbx"]}, "'glb', 'ply', 'obj', 'stl' or 'usdz'"),
-        ("mesh", {"up_axis": "x"}, "'z' or 'y'"),
+        ("mesh", {"up_axis": "x"}, "'auto', 'z' or 'y'"),
         ("mesh", {"method": "ball_pivoting"}, "'poisson' or 'marching_cubes'"),
         ("pointcloud", {"formats": []}, "at least 1"),
         ("pointcloud", {"formats": ["ply", "e57"]}, "'las', 'laz', 'xyz' or 'colmap'"),
@@ -96,3 +97,30 @@ def test_a_format_asked_for_twice_is_written_once() -> None:
     assert resolve_options("preview", {"mesh": {"formats": ["glb", "stl", "glb"]}})["mesh"][
         "formats"
     ] == ["glb", "stl"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "up"),
+    [
+        ({}, {"obj": "y", "ply": "z", "stl": "z"}),
+        ({"up_axis": "z"}, {"obj": "z", "ply": "z", "stl": "z"}),
+        ({"up_axis": "y"}, {"obj": "y", "ply": "y", "stl": "y"}),
+        ({"frame": "normalised"}, {"obj": "y", "ply": "z", "stl": "z"}),
+        ({"frame": "source"}, {"obj": "z", "ply": "z", "stl": "z"}),
+        ({"frame": "source", "up_axis": "y"}, {"obj": "y", "ply": "y", "stl": "y"}),
+    ],
+)
+def test_each_format_has_up_what_programs_take_it_for_unless_asked_otherwise(
+    asked: dict[str, str], up: dict[Format, str]
+) -> None:
+    options = MeshOptions.model_validate(asked)
+    assert {name: options.up_in(name) for name in up} == up
+
+
+@pytest.mark.parametrize("stored", ["z", "y"])
+def test_a_stored_jobs_axis_stays_what_it_was(stored: str) -> None:
+    """Jobs from before there was `auto` have one of these, `z` where they had not asked."""
+    own = {**resolve_options("preview", {})["mesh"], "up_axis": stored}
+    assert resolve_export("mesh", "preview", own, {"formats": ["obj"]})["up_axis"] == stored
+    again = resolve_export("mesh", "preview", own, {"up_axis": "auto"})
+    assert again["up_axis"] == "auto"
