@@ -4,7 +4,8 @@ The world of `cameras.json`: right-handed, +Z up as far as the capture tells, in
 `metric`, else in a unit of its own. Every artifact of a job lies there, in one place, unless
 another frame is asked for (`pipelines.exports.placement`). Formats differ in their axes alone: glTF
 and USD have +Y up by their specifications, OBJ by custom, (x, y, z) -> (x, z, -y), the others +Z,
-unless asked for otherwise. No format scales or moves anything.
+unless asked for otherwise. No format moves anything, and none scales but STL of a mesh in metres,
+which is in millimetres unless asked for otherwise (`MeshOptions.stl_unit`).
 
 A file in another frame also says how the world of `cameras.json` came into its own coordinates,
 axes and all: `Frame.matrix`, in formats that can hold it.

@@ -108,6 +108,7 @@ def write_mesh(
 ) -> None:
     """The files, `mesh` with its vertices' colours and `skin` as it is painted, if it is."""
     told = ctx.told_part("writing", _TEXTURE_SHARE, _SUBJECT_SHARE)
+    in_millimetres = options.stl_unit == "millimetre" and place.metric
     frames = {name: place.frame(options.up_in(name)) for name in _FILES}
     mesh, skin = place.mesh(mesh), place.mesh(skin)
     # A GLB is written in any case: what is delivered is judged by it.
@@ -124,7 +125,7 @@ def write_mesh(
         ),
         "ply": lambda path: ply.write_mesh(path, mesh, frames["ply"]),
         "obj": lambda path: obj.write_mesh(path, skin, frames["obj"], told_of("obj")),
-        "stl": lambda path: stl.write_mesh(path, mesh, frames["stl"]),
+        "stl": lambda path: stl.write_mesh(path, mesh, frames["stl"], in_millimetres),
         "usdz": lambda path: usdz.write_mesh(path, skin, frames["usdz"]),
     }
     for name in names:

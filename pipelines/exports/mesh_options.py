@@ -29,6 +29,13 @@ class MeshOptions(CropOptions, TextureOptions):
         "In glb and usdz it is always y.",
     )
 
+    stl_unit: Literal["millimetre", "frame"] = Field(
+        "millimetre",
+        description="What a unit of stl is, which cannot say it: millimetre is what slicers take "
+        "it for, and what stl has where a unit of the frame is a metre; where that length is "
+        "unknown, and with frame, stl has the frame's own unit as all other files do.",
+    )
+
     extent: Literal["auto", "subject", "scene"] = Field(
         "auto",
         description="scene is all that lies within far_distance, more coarsely beyond "

@@ -36,6 +36,20 @@ def test_other_programs_read_the_solid_with_its_outside_out(
     assert f"+{up.upper()} up".encode() in header
 
 
+def test_a_slicer_gets_the_millimetres_that_it_takes_a_unit_for(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.stl"
+    stl.write_mesh(path, solids.coloured(), Frame(metric=True), in_millimetres=True)
+    mesh = trimesh.load_mesh(path)
+    wanted = 1000.0 * solids.VERTICES
+    np.testing.assert_allclose(mesh.bounds, [wanted.min(0), wanted.max(0)], rtol=1e-6)
+    length = np.linalg.norm(np.frombuffer(path.read_bytes()[84:96], "<f4"))
+    assert length == pytest.approx(1.0), "normals have no unit"
+    header = path.read_bytes()[:80].rstrip(b"\0")
+    assert header.endswith(b"; 1 unit is 1 mm")
+    with pytest.raises(ValueError, match="metres alone"):
+        stl.write_mesh(path, solids.coloured(), Frame(), in_millimetres=True)
+
+
 def test_a_face_without_area_does_not_spoil_the_file(tmp_path: Path) -> None:
     mesh = solids.coloured()
     mesh.faces[0] = [1, 1, 2]
