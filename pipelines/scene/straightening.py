@@ -18,7 +18,7 @@ from pipelines.scene.pitch import FARTHEST, FEWEST_POINTS, LINE, share_on_lines
 
 Array = npt.NDArray[np.float64]
 
-_ASLANT_DEG, _MOST_DEG = 4.5, 15.0
+_ASLANT_DEG, _MOST_DEG = 4.5, 20.0
 """How far off cameras are at most that were turned through a circle, times the root of a half; and
 the most that is looked for of any."""
 _STEP_DEG, _FINER, _PEAK = 1.0, 7, 8
