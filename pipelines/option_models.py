@@ -20,10 +20,41 @@ from pipelines.nerf.options.train import TrainConfig, default_train_config
 from pipelines.nerf.plugins import Method
 
 
+class ContradictionError(ValueError):
+    """A request that says two things of which one can be done. name: of one of the options."""
+
+    def __init__(self, name: str, problem: str) -> None:
+        super().__init__(problem)
+        self.name = name
+
+
 class StageOptions(BaseModel):
     """Common ground: unknown keys are refused, values are checked, instances are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+    @classmethod
+    def understood(
+        cls, base: dict[str, Any], given: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What lies under a request without what the request takes back of it, and the request
+        with what it implies.
+
+        base: complete options, or none. given: not checked yet. Neither is changed. Raises
+        ContradictionError.
+        """
+        return base, given
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`base` with the nested keys of `over` laid on top; neither is changed."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict):
+            merged[key] = merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
 
 
 def _field_of(

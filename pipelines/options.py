@@ -24,7 +24,7 @@ from pipelines.nerf.options.evaluate import EvaluateConfig
 from pipelines.nerf.options.methods.nerfacto import NERFACTO
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import SplitConfig, TrainConfig, config_from_dict, validate
-from pipelines.option_models import StageOptions, model_of
+from pipelines.option_models import ContradictionError, StageOptions, merge, model_of
 from pipelines.presets import PRESETS
 from pipelines.registry import STAGE_NAMES, skipped_stages
 
@@ -373,15 +373,14 @@ class OptionsError(ValueError):
         self.errors = errors
 
 
-def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the nested keys of `over` laid on top; neither is changed."""
-    merged = dict(base)
-    for key, value in over.items():
-        if isinstance(value, dict) and isinstance(merged.get(key), dict):
-            merged[key] = merge(merged[key], value)
-        else:
-            merged[key] = value
-    return merged
+def laid_over(
+    stage: str, model: type[StageOptions], base: dict[str, Any], given: dict[str, Any]
+) -> dict[str, Any]:
+    """`given` laid over a base, as the model understands both. Raises OptionsError."""
+    try:
+        return merge(*model.understood(base, given))
+    except ContradictionError as error:
+        raise OptionsError([(f"{stage}.{error.name}", str(error))]) from error
 
 
 @functools.cache
@@ -390,10 +389,13 @@ def _defaults(model: type[StageOptions]) -> dict[str, Any]:
     return model().model_dump(mode="json")
 
 
-def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def resolve_options(
+    preset: str, overrides: dict[str, Any], *, is_request: bool = True
+) -> dict[str, dict[str, Any]]:
     """Complete, checked, JSON-able options of all stages.
 
-    preset: a key of `PRESETS`. overrides: nested `{stage: {option: value}}`.
+    preset: a key of `PRESETS`. overrides: nested `{stage: {option: value}}`; a request, unless they
+    were laid over others already (`laid_over`).
     Raises OptionsError naming each wrong option and each stage that has options here and is left
     out by the preset, and KeyError for an unknown preset.
     """
@@ -417,7 +419,9 @@ def resolve_options(preset: str, overrides: dict[str, Any]) -> dict[str, dict[st
                 model, base, wanted["train"] = _train_ground(given, wanted.get("train", {}))
             else:
                 base = _defaults(model)
-            checked = model.model_validate(merge(merge(base, wanted.get(name, {})), given))
+            base = merge(base, wanted.get(name, {}))
+            laid = laid_over(name, model, base, given) if is_request else merge(base, given)
+            checked = model.model_validate(laid)
             if name == "train":
                 validate(train_config(checked))
         except OptionsError as error:
@@ -456,7 +460,11 @@ def revise_options(
     training = changes.get("train")
     if isinstance(training, dict) and training.get("method", present_method) != present_method:
         kept.pop("train", None)
-    return resolve_options(preset, merge(kept, changes))
+    for name, given in changes.items():
+        if isinstance(given, dict) and name in STAGE_OPTIONS:
+            given = laid_over(name, STAGE_OPTIONS[name], kept.get(name, {}), given)
+        kept[name] = given
+    return resolve_options(preset, kept, is_request=False)
 
 
 def _hold_out_the_same(resolved: dict[str, dict[str, Any]], overrides: dict[str, Any]) -> None:

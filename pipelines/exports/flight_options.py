@@ -6,12 +6,13 @@ Wrong requests are refused here, with the range, before anything is rendered.
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from pipelines.exports.options import RenderingOptions
 from pipelines.exports.paths.options import MAX_FRAMES, MAX_SIDE_PX, CameraType, PathOptions
+from pipelines.exports.wishes import LENGTH, SIZE, chosen
 
 
 class FlightOptions(RenderingOptions, PathOptions):
@@ -110,6 +111,14 @@ class FlightOptions(RenderingOptions, PathOptions):
                 f"an equirectangular picture is twice as wide as it is high, not {width}x{height}"
             )
         return self
+
+    @classmethod
+    def understood(
+        cls, base: dict[str, Any], given: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As in StageOptions: the length or the size that is asked for is what counts."""
+        base, given = super().understood(base, given)
+        return chosen(SIZE, chosen(LENGTH, base, given), given), given
 
     def num_side_by_side(self) -> int:
         """How many outputs one picture holds."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
 from pipelines.exports.frame import FrameName
+from pipelines.exports.wishes import without_what_is_overridden
 from pipelines.nerf.options.render import RenderConfig
 from pipelines.nerf.options.train import config_from_dict
 from pipelines.option_models import StageOptions, model_of
@@ -124,6 +125,14 @@ class CropOptions(RenderingOptions, ExtentOptions, FrameOptions):
         description="Let the depth maps of the stage depth vote on surfaces beside the trained "
         "field. auto does so where a sensor measured some of them, or they are fewer than 40.",
     )
+
+    @classmethod
+    def understood(
+        cls, base: dict[str, Any], given: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As in StageOptions: the crop or the extent that is asked for is what counts."""
+        base, given = super().understood(base, given)
+        return without_what_is_overridden(base, given, cls.model_fields["extent"].default), given
 
 
 def reach_of(options: ExtentOptions) -> float:

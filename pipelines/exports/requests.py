@@ -11,8 +11,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from pipelines.exports.catalogue import get_export
-from pipelines.option_models import StageOptions
-from pipelines.options import OptionsError, merge
+from pipelines.option_models import StageOptions, merge
+from pipelines.options import OptionsError, laid_over
 from pipelines.presets import PRESETS
 
 _SWITCH = "enabled"
@@ -25,8 +25,9 @@ def resolve_export(
     """Complete, checked, JSON-able options of one export.
 
     preset: the job's. job_options: what the job itself has for this kind, which `given` is laid
-    over: an export without options is what the job makes. Where they are of an older version and
-    no longer valid, the preset's take their place. given: may be anything that JSON can be.
+    over: an export without options is what the job makes. Of two ways to say one thing the job's
+    gives way to the one that is given. Where the job's are of an older version and no longer valid,
+    the preset's take their place. given: may be anything that JSON can be.
     Raises OptionsError naming each wrong option, KeyError for an unknown kind.
     """
     model = get_export(kind).options
@@ -39,7 +40,8 @@ def resolve_export(
         if name in model.model_fields and model.model_fields[name].default is None:
             base[name] = None  # one thing, such as a file: two of them are not mixed
     try:
-        return model.model_validate(merge(base, dict(given))).model_dump(mode="json")
+        laid = laid_over(kind, model, base, dict(given))
+        return model.model_validate(laid).model_dump(mode="json")
     except ValidationError as error:
         raise OptionsError(
             [

@@ -9,7 +9,7 @@ import pytest
 
 from api.client.client import Client
 from deploy.embedded import Embedded, free_port
-from pipelines.options import merge
+from pipelines.option_models import merge
 from tests.capture_writers import write_polycam
 from tests.e2e.waiting import succeeded
 from tests.samples import PLAIN, SMALL

@@ -13,7 +13,8 @@ from api.client.client import Client
 from deploy.embedded import Embedded
 from deploy.supervisor import Supervisor
 from pipelines.exports.formats.ply import read_ply
-from pipelines.options import ON_REQUEST, merge
+from pipelines.option_models import merge
+from pipelines.options import ON_REQUEST
 from pipelines.registry import STAGE_NAMES, STAGES
 from pipelines.sample.film import phone_camera, render_all, walk
 from pipelines.sample.judge import judge_mesh, judge_poses
