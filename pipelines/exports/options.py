@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from pipelines.exports.frame import FrameName
-from pipelines.exports.wishes import without_what_is_overridden
+from pipelines.exports.wishes import with_its_shape, without_what_is_overridden
 from pipelines.nerf.options.render import RenderConfig
 from pipelines.nerf.options.train import config_from_dict
 from pipelines.option_models import StageOptions, model_of
@@ -130,8 +130,11 @@ class CropOptions(RenderingOptions, ExtentOptions, FrameOptions):
     def understood(
         cls, base: dict[str, Any], given: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """As in StageOptions: the crop or the extent that is asked for is what counts."""
+        """As in StageOptions: numbers of a crop tell its shape; the crop or the extent that is
+        asked for is what counts."""
         base, given = super().understood(base, given)
+        if isinstance(given.get("crop"), dict):
+            given = {**given, "crop": with_its_shape(base.get("crop", {}), given["crop"])}
         return without_what_is_overridden(base, given, cls.model_fields["extent"].default), given
 
 

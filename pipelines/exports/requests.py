@@ -36,9 +36,6 @@ def resolve_export(
         if given.get(_SWITCH, True) is False:
             raise OptionsError([(f"{kind}.{_SWITCH}", "an export that is asked for is made")])
         base[_SWITCH] = True
-    for name in given:
-        if name in model.model_fields and model.model_fields[name].default is None:
-            base[name] = None  # one thing, such as a file: two of them are not mixed
     try:
         laid = laid_over(kind, model, base, dict(given))
         return model.model_validate(laid).model_dump(mode="json")

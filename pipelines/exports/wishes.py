@@ -1,9 +1,10 @@
 """What a request for an export means, beside what lies under it: a job's own options, a preset's.
 
-Some options say one thing in two ways, such as how long a film is. Here is what a request that
-takes one of these ways takes back of what lies under it, and where it contradicts itself. Options
-of a request that are as they lie under it contradict nothing: who sends all of a job's options
-again, with one changed, means that one. Light: the API reads it.
+Some options say one thing in two ways, such as how long a film is; others belong to one shape of a
+crop, or one path, alone. Here is what a request with one of them takes back of what lies under it,
+what it implies, and where it contradicts itself. Options of a request that are as they lie under it
+contradict nothing: who sends all of a job's options again, with one changed, means that one. Light:
+the API reads it.
 
 base: options that lie under a request, complete or none. given: the request, not checked yet: it
 may be anything that JSON can be.
@@ -33,6 +34,15 @@ class Choice:
 
 LENGTH = Choice((("num_frames",), ("seconds",)), ("turn_deg_per_s", "min_seconds", "max_seconds"))
 SIZE = Choice((("width_px", "height_px"),), ("long_side_px",))
+
+_NUMBERS = {
+    "box": ("center", "size", "rotation_deg"),
+    "sphere": ("center", "radius"),
+    "auto": (),
+}
+"""What says where a crop of each shape is, and how large."""
+_PATHS = ("orbit", "spiral", "keyframes", "camera_path")
+"""Paths with options of their name."""
 
 
 def chosen(choice: Choice, base: Options, given: Options) -> Options:
@@ -79,6 +89,64 @@ def without_what_is_overridden(base: Options, given: Options, usual_extent: str)
     if extent is None and base.get("extent") == "subject":
         return {**base, "extent": usual_extent}
     return base
+
+
+def with_its_shape(base: Options, given: Options) -> Options:
+    """The request with the shape of its crop, where its numbers are of one shape alone.
+
+    base, given: of the crop. Raises ContradictionError where they are of no shape, or of another
+    than the one that counts; what lies in a crop of shape `none` is of no shape.
+    """
+    numbers = [name for name in ("center", "size", "rotation_deg", "radius") if name in given]
+    if "shape" not in given:
+        own = base.get("shape", "none")
+        shapes = {
+            shape for shape, of in _NUMBERS.items() if shape != "auto" and {*numbers} <= {*of}
+        }
+        if not numbers or own in shapes:
+            return given
+        if "size" in given and "box" in shapes:
+            return {**given, "shape": "box"}
+        if "radius" in given and "sphere" in shapes:
+            return {**given, "shape": "sphere"}
+        raise ContradictionError(
+            "crop.shape",
+            f"{' and '.join(numbers)} alone say not what is kept: add shape, which is box with "
+            "center, size and rotation_deg, or sphere with center and radius",
+        )
+    of_shape = _NUMBERS.get(str(given["shape"]), tuple(numbers))
+    strange = [name for name in numbers if name not in of_shape and is_new(name, base, given)]
+    if strange:
+        has = f"has {', '.join(of_shape)}" if of_shape else "is found by itself"
+        raise ContradictionError(
+            f"crop.{strange[0]}",
+            f"a crop of shape {given['shape']} {has}, and no {' or '.join(strange)}: leave that "
+            "out, or change shape",
+        )
+    return given
+
+
+def with_its_path(base: Options, given: Options) -> Options:
+    """The request with its path, where it has the options of one path alone.
+
+    Raises ContradictionError where it has those of several, or of another path than its own.
+    """
+    named = [name for name in _PATHS if given.get(name)]
+    if "path" in given:
+        path = given["path"]
+        strange = [name for name in named if name != path and is_new(name, base, given)]
+        if strange:
+            raise ContradictionError(
+                strange[0],
+                f"{strange[0]} is of the path {strange[0]}, and path is {path}: leave one of them "
+                "out",
+            )
+        return given
+    if len(named) > 1:
+        raise ContradictionError(
+            named[0], f"{' and '.join(named)} are of different paths: add path, or leave one out"
+        )
+    return {**given, "path": named[0]} if named else given
 
 
 def is_new(name: str, base: Options, given: Options) -> bool:

@@ -85,6 +85,14 @@ class ViewsOptions(RenderingOptions, PathOptions):
     def _each_once(cls, values: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(dict.fromkeys(values))
 
+    @classmethod
+    def understood(
+        cls, base: dict[str, Any], given: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As in StageOptions: who asks for a path asks for the views along it."""
+        base, given = super().understood(base, given)
+        return base, {"cameras": "path", **given} if "path" in given else given
+
     @model_validator(mode="after")
     def _is_perspective(self) -> ViewsOptions:
         if self.camera_path is not None and self.camera_path.camera_type != "perspective":

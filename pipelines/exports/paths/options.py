@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from pipelines.exports.paths.catalogue import PATHS
+from pipelines.exports.wishes import with_its_path
 from pipelines.option_models import StageOptions
 
 CameraType = Literal["perspective", "fisheye", "equirectangular"]
@@ -247,6 +248,15 @@ class PathOptions(StageOptions):
                     "it where loop is on, or for none"
                 )
         return self
+
+    @classmethod
+    def understood(
+        cls, base: dict[str, Any], given: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As in StageOptions: a path's own options tell the path, and two files are not mixed."""
+        base, given = super().understood(base, given)
+        given = with_its_path(base, given)
+        return ({**base, "camera_path": None} if "camera_path" in given else base), given
 
     def durations_s(self) -> list[float] | None:
         """How long each way between keyframes takes, the one back last; None where nobody says."""
