@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.mesh_options import LEAST_TRIANGLES
 from pipelines.exports.reduction import reduced
 
 SHARE = 4
-LEAST_TRIANGLES = 64
 LEAST_TEXTURE_PX = 512
 
 

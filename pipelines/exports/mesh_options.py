@@ -11,6 +11,9 @@ from pipelines.exports.options import CropOptions, TextureOptions
 
 Format = Literal["glb", "ply", "obj", "stl", "usdz"]
 
+LEAST_TRIANGLES = 64
+"""Of a whole mesh: with fewer next to nothing is left of what was filmed."""
+
 
 class MeshOptions(CropOptions, TextureOptions):
     """The mesh, by fusing rendered depth."""
@@ -121,8 +124,8 @@ class MeshOptions(CropOptions, TextureOptions):
         0,
         ge=0,
         le=20_000_000,
-        description="Triangles of the whole mesh as it is delivered, 100000 for phones and the "
-        "web; 0 for all that max_faces leaves. Open borders stay.",
+        description="Triangles of the whole mesh as it is delivered, 64 or more, 100000 for phones "
+        "and the web; 0 for all that max_faces leaves. Open borders stay.",
     )
     lods: int = Field(
         0,
@@ -169,3 +172,13 @@ class MeshOptions(CropOptions, TextureOptions):
     @classmethod
     def _each_once(cls, formats: tuple[Format, ...]) -> tuple[Format, ...]:
         return tuple(dict.fromkeys(formats))
+
+    @field_validator("triangles")
+    @classmethod
+    def _leaves_a_mesh(cls, triangles: int) -> int:
+        if 0 < triangles < LEAST_TRIANGLES:
+            raise ValueError(
+                f"a mesh of {triangles} triangles shows nothing: ask for {LEAST_TRIANGLES} or "
+                "more, or for 0, which is all there are"
+            )
+        return triangles

@@ -60,6 +60,8 @@ _RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
 _MEND_SHARE, _CLOSED_SHARE, _OTHERS_SHARE = 0.78, 0.79, 0.793
 _FREE_SHARE, _CARVED_SHARE, _REFINE_SHARE = 0.797, 0.8, 0.83
 _CLEARING = "clearing what is empty"
+_OVER = 1.1
+"""Times as many triangles as were asked for, which is told."""
 _OTHERS_PX = 64
 _MOST_CARVING = 400
 """Photos that tell what is empty: more tell no more, and their maps are held at once."""
@@ -309,13 +311,29 @@ def part_of(options: MeshOptions, plan: Plan, surface: Surface, ctx: StageContex
 
 
 def finished(part: Part, options: MeshOptions, ctx: StageContext) -> Part:
-    """The part with the triangles asked for, closed all over where that is asked for."""
+    """The part with the triangles asked for, closed all over where that is asked for.
+
+    Raises ExportError `empty_mesh` where nothing is left with so few.
+    """
     mesh = part.mesh
     if options.triangles:
         words = f"reducing {len(mesh.faces)} triangles"
         told = ctx.told_part(words, _REFINE_SHARE, REDUCE_SHARE)
         told(0.0)
         mesh = reduced(mesh, options.triangles, told)
+        if len(mesh.faces) == 0:
+            raise ExportError(
+                f"Of {len(part.mesh.faces)} triangles nothing is left in {options.triangles}.",
+                code="empty_mesh",
+                hint="Ask for more of them: raise mesh.triangles, or leave it out.",
+            )
+        if len(mesh.faces) > _OVER * options.triangles:
+            ctx.logger.warning(
+                "The mesh has %d triangles, and not the %d that were asked for: its pieces and "
+                "holes need so many. Cut out the subject (mesh.extent), or crop, for fewer.",
+                len(mesh.faces),
+                options.triangles,
+            )
     if options.watertight:
         ctx.progress(REDUCE_SHARE, "closing the mesh all over")
         mesh = made_watertight(mesh, part.down, lambda done: ctx.check_cancelled())

@@ -28,6 +28,8 @@ from pipelines.exports.surface.open3d_mesh import from_open3d, to_open3d
 
 _LEAST_PIECE = 200
 """Faces; what is smaller is reduced together with its like."""
+_LEAST_SHARE = 4
+"""Faces that a piece keeps: with fewer it is no surface any more, or gone."""
 LARGE = 300_000
 """Faces of a piece that has a process of its own."""
 _USUAL_S = 6e-6
@@ -45,7 +47,8 @@ def reduced(
 ) -> TriangleMesh:
     """The mesh with so many triangles; one that has no more stays as it is.
 
-    A few more remain where no edge can be taken away without turning a triangle over. on_progress:
+    A few more remain where no edge can be taken away without turning a triangle over, and where
+    there are so many pieces that the least of each is more. on_progress:
     told a share that rises, every second also within a large piece; what it raises ends the work.
     """
     total = len(mesh.faces)
@@ -53,7 +56,7 @@ def reduced(
         return mesh
     piece = _pieces(mesh)
     sizes = np.bincount(piece)
-    shares = np.floor(sizes * (triangles / total)).astype(int)
+    shares = _shares(sizes, triangles)
     before = np.cumsum(sizes) - sizes
     parts = []
     for index, share in enumerate(shares):
@@ -64,6 +67,19 @@ def reduced(
         parts.append(_fewer(mesh.with_faces(mesh.faces[piece == index]), int(share), on_part))
         on_part(1.0)
     return joined([part for part in parts if len(part.faces)])
+
+
+def _shares(sizes: NDArray[np.int64], triangles: int) -> NDArray[np.int64]:
+    """Faces that are left of pieces with so many: the same share, the least, or all there are.
+
+    What the least takes is given by the pieces that keep most.
+    """
+    least = np.minimum(sizes, _LEAST_SHARE)
+    even = np.floor(sizes * (triangles / sizes.sum())).astype(np.int64)
+    shares: NDArray[np.int64] = np.maximum(even, least)
+    for index in np.argsort(-shares, kind="stable"):
+        shares[index] -= min(max(shares.sum() - triangles, 0), shares[index] - least[index])
+    return shares
 
 
 def _fewer(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.exports.levels import LEAST_TRIANGLES, levels_of, texture_px_of
+from pipelines.exports.levels import levels_of, texture_px_of
 from pipelines.exports.mesh import TriangleMesh
+from pipelines.exports.mesh_options import LEAST_TRIANGLES
 from pipelines.exports.reduction import reduced
 from pipelines.exports.surface.tsdf import fuse
 from pipelines.sample.film import phone_camera, walk

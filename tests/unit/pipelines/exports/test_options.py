@@ -78,6 +78,7 @@ def test_an_export_has_exactly_the_formats_asked_for(
         ("pointcloud", {"formats": ["ply", "e57"]}, "'las', 'laz', 'xyz' or 'colmap'"),
         ("pointcloud", {"spacing": -0.1}, "greater than or equal to 0"),
         ("mesh", {"triangles": -1}, "greater than or equal to 0"),
+        ("mesh", {"triangles": 20}, "64 or more, or for 0"),
         ("mesh", {"crop": {"shape": "box", "size": [1.0, 0.0, 1.0]}}, "greater than 0"),
         ("mesh", {"crop": {"shape": "box", "rotation_deg": [0, 0, 400]}}, "or equal to 360"),
         ("pointcloud", {"crop": {"shape": "sphere", "radius": 0}}, "greater than 0"),

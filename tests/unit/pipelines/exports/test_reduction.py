@@ -111,6 +111,27 @@ def test_many_small_pieces_are_reduced_together() -> None:
     assert 0.4 * len(crumbs.faces) < len(few.faces) <= len(crumbs.faces) // 2
 
 
+def test_each_piece_keeps_enough_to_be_seen_however_few_are_asked_for() -> None:
+    """A floor of each one's share left none of them."""
+    places = [_FAR + 3.0 * i for i in range(30)]
+    for few_to_keep, left in ((64, 120), (60 * 30, 60 * 30)):
+        few = reduced(joined([ball(place, 1.0, 12) for place in places]), few_to_keep)
+        assert len(few.faces) == left
+        at = few.vertices[few.faces].mean(axis=1)
+        counts = [(np.linalg.norm(at - place, axis=1) < 1.0).sum() for place in places]
+        assert min(counts) >= 4
+
+
+def test_what_small_pieces_keep_comes_from_the_large_one() -> None:
+    mesh = joined(
+        [ball(_FAR + 300.0, 100.0, 60), *(ball(_FAR + 3.0 * i, 1.0, 11) for i in range(8))]
+    )
+    few = reduced(mesh, 150)
+    assert len(few.faces) <= 150
+    near = np.linalg.norm(few.vertices - _FAR, axis=1) < 50.0
+    assert near[few.faces].all(axis=1).sum() >= 8 * 4
+
+
 def test_a_mesh_that_is_small_enough_stays_as_it_is() -> None:
     mesh = sheet(10)
     assert reduced(mesh, len(mesh.faces)) is mesh

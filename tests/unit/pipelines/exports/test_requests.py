@@ -39,8 +39,8 @@ def test_wishes_are_laid_over_what_the_job_has() -> None:
 @pytest.mark.parametrize("stale", [{"gone": 1}, {"max_faces": "many"}, {"max_faces": 10**12}])
 def test_options_of_an_older_version_give_way_to_the_presets(stale: dict[str, Any]) -> None:
     own = {**resolve_options("preview", {})["mesh"], **stale}
-    made = resolve_export("mesh", "preview", own, {"triangles": 5})
-    assert made == {**resolve_options("preview", {})["mesh"], "triangles": 5}
+    made = resolve_export("mesh", "preview", own, {"triangles": 500})
+    assert made == {**resolve_options("preview", {})["mesh"], "triangles": 500}
     assert resolve_export("mesh", "a preset that is no more", own, {})["max_faces"] == 200_000
 
 
