@@ -78,8 +78,13 @@ class ObjectStore(Protocol):
     def drop_unfinished(self, before: datetime) -> int:
         """Drop what transfers that were cut short before then left. Returns how many."""
 
-    def signed_url(self, key: str, *, expires_s: int, filename: str, media_type: str) -> str:
-        """A URL that lets anyone download this one object for so many seconds."""
+    def signed_url(
+        self, key: str, *, expires_s: int, filename: str, media_type: str, sha256: str = ""
+    ) -> str:
+        """A URL that lets anyone download this one object for so many seconds.
+
+        sha256: of its content, for an answer's ETag where that is ours to give.
+        """
 
     def ping(self) -> None:
         """Raise ObjectStoreError where the store does not answer."""

@@ -187,10 +187,12 @@ class LocalObjectStore:
                     dropped += 1
         return dropped
 
-    def signed_url(self, key: str, *, expires_s: int, filename: str, media_type: str) -> str:
+    def signed_url(
+        self, key: str, *, expires_s: int, filename: str, media_type: str, sha256: str = ""
+    ) -> str:
         """A URL of the API that `verify_object_token` accepts for so many seconds."""
         expires_at = int(time.time()) + expires_s
-        signed = SignedObject(check_key(key), filename, media_type, expires_at)
+        signed = SignedObject(check_key(key), filename, media_type, expires_at, sha256)
         return f"{self._public_url}/v1/objects/{make_object_token(self._signing_key, signed)}"
 
     def ping(self) -> None:

@@ -172,8 +172,11 @@ class S3ObjectStore:
                         dropped += 1
         return dropped
 
-    def signed_url(self, key: str, *, expires_s: int, filename: str, media_type: str) -> str:
-        """A presigned GET of one object."""
+    def signed_url(
+        self, key: str, *, expires_s: int, filename: str, media_type: str, sha256: str = ""
+    ) -> str:
+        """A presigned GET of one object, whose ETag is the bucket's own."""
+        del sha256
         with _translated(key):
             url: str = self._signer.generate_presigned_url(
                 "get_object",

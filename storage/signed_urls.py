@@ -18,18 +18,22 @@ from storage.errors import InvalidUrlError
 
 @dataclass(frozen=True)
 class SignedObject:
-    """What a local signed URL allows: reading one object, as a download of this name and type."""
+    """What a local signed URL allows: reading one object, as a download of this name and type.
+
+    sha256: of its content, "" where who signed did not know.
+    """
 
     key: str
     filename: str
     media_type: str
     expires_at: int
+    sha256: str = ""
 
 
 def make_object_token(signing_key: bytes, signed: SignedObject) -> str:
     """The last part of a local signed URL."""
     payload = json.dumps(
-        [signed.key, signed.filename, signed.media_type, signed.expires_at],
+        [signed.key, signed.filename, signed.media_type, signed.expires_at, signed.sha256],
         separators=(",", ":"),
     ).encode()
     mac = hmac.digest(signing_key, b"nerfworks object url\0" + payload, hashlib.sha256)

@@ -85,7 +85,7 @@ def download_object(token: str, services: SharedServicesDep, request: Request) -
         services,
         key=signed.key,
         size=stat.bytes,
-        tag=stat.etag,
+        tag=signed.sha256 or stat.etag,
         filename=signed.filename,
         media_type=signed.media_type,
     )

@@ -104,6 +104,7 @@ def signed_url(services: Services, found: Published, request: Request) -> str:
         expires_s=services.settings.url_expires_s,
         filename=found.artifact.name,
         media_type=found.artifact.media_type,
+        sha256=found.sha256,
     )
     if isinstance(services.store, LocalObjectStore):
         public = services.settings.public_url.rstrip("/")

@@ -163,6 +163,17 @@ def test_signed_url_needs_no_key_and_takes_ranges(done: tuple[Service, str]) -> 
         assert same.status_code == 304
 
 
+def test_a_download_goes_on_at_the_other_address(done: tuple[Service, str]) -> None:
+    """Its tag is the same at both."""
+    service, path = done
+    item = next(each for each in service.http.get(path).json()["items"] if each["bytes"] > 9)
+    for url in (f"{path}/{item['name']}", item["url"]):
+        answer = service.http.get(url, headers={"Range": "bytes=5-9", "If-Range": TAG})
+        assert (answer.status_code, answer.headers["etag"]) == (206, TAG)
+    signed = SignedObject("captures/x", "x", "text/plain", 2**40)
+    assert signed.sha256 == "", "as of URLs that versions before signed"
+
+
 def test_signed_url_goes_to_the_address_that_the_client_came_by(
     done: tuple[Service, str],
 ) -> None:
