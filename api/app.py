@@ -20,6 +20,7 @@ from api import catalogue, errors, health, workers
 from api.artifacts import endpoints as artifacts
 from api.captures import endpoints as captures
 from api.captures.receiving import sweep
+from api.cross_origin import CrossOrigin
 from api.deps import MAX_CREATIONS, MAX_STORE_CALLS, Services, require_key
 from api.documentation import page_of
 from api.exports import endpoints as exports
@@ -156,6 +157,9 @@ def create_app(settings: ApiSettings | None = None) -> FastAPI:
         max_body_s=settings.small_body_s,
         upload_path=captures.PATH,
         routes=[*app.routes, *(route for one in (*keyed, *others) for route in one.routes)],
+    )
+    app.add_middleware(
+        CrossOrigin, downloads=f"{artifacts.signed_router.prefix}/", origins=settings.cors_origins
     )
     for router in keyed:
         app.include_router(router, dependencies=[Depends(require_key)])

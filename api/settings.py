@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import Field, SecretStr
-from pydantic_settings import SettingsConfigDict
+from pydantic import Field, SecretStr, field_validator
+from pydantic_settings import NoDecode, SettingsConfigDict
 
 from storage.settings import StorageSettings
+
+_ORIGIN = re.compile(r"https?://([a-z0-9.-]+|\[[0-9a-f:.]+\])(:[0-9]{1,5})?")
 
 
 class ApiSettings(StorageSettings):
@@ -38,6 +42,11 @@ class ApiSettings(StorageSettings):
     url_expires_s: int = Field(
         900, ge=60, le=604_800, description="How long a signed download URL is good, in seconds."
     )
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
+        (),
+        description="Origins, separated by commas, whose web pages may call the API with a key, as "
+        "https://app.example.org; none for only downloads at signed URLs, which all pages may.",
+    )
     check_timeout_s: float = Field(
         3.0, gt=0, le=60, description="How long /readyz waits for each part, in seconds."
     )
@@ -48,6 +57,25 @@ class ApiSettings(StorageSettings):
     bootstrap_api_key_file: Path | None = Field(
         None, description="A file that holds such a key (a mounted secret)."
     )
+
+    @field_validator("cors_origins", mode="before")
+    @classmethod
+    def _split(cls, origins: Any) -> Any:
+        if isinstance(origins, str):
+            return tuple(part.strip() for part in origins.split(",") if part.strip())
+        return origins
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        for origin in origins:
+            if not _ORIGIN.fullmatch(origin):
+                raise ValueError(
+                    f"{origin!r} is no origin: write each as browsers send it, such as "
+                    "https://app.example.org or http://localhost:5173, without a path; * and null "
+                    "are everybody, who must not call the API"
+                )
+        return origins
 
     @property
     def staging_dir(self) -> Path:
