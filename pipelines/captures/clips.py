@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.captures.archive_rules import ArchiveLimits, shown
+from pipelines.captures.film_copies import film_copies
 from pipelines.captures.importers.video import Checked, check
 from pipelines.captures.leftovers import as_details, leftover_warnings, leftovers
 from pipelines.captures.magic import video_container
@@ -75,8 +76,8 @@ def read_film(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
 def read_films(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
     """An archive of videos, in the natural order of their names.
 
-    A clip that cannot be used, and one that is there twice, is left out and told; the error of the
-    first where none is left. Raises CaptureError as `read_film` does, too_few_images.
+    A clip that cannot be used, and one that is a copy of another, is left out and told; the error
+    of the first where none is left. Raises CaptureError as `read_film` does, too_few_images.
     """
     found: dict[str, Checked] = {}
     unusable: dict[str, CaptureError] = {}
@@ -84,7 +85,7 @@ def read_films(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
     with CaptureArchive(path, ArchiveLimits(options.max_unpacked_bytes)) as archive:
         names = _clip_names(archive)
         for done, name in enumerate(names):
-            archive.extract(name, target)
+            archive.copy(name, target)
             try:
                 part = _part_of(ctx, done, len(names))
                 found[name] = check(target, options, part, minimum=1)
@@ -92,6 +93,11 @@ def read_films(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
                 unusable[name] = error
             finally:
                 target.unlink(missing_ok=True)
+        num_bytes = {name: archive.num_bytes(name) for name in found}
+        for name, whole in film_copies(found, num_bytes, archive.copy, target, ctx).items():
+            how = "smaller copy" if _is_smaller(found.pop(name), found[whole]) else "copy"
+            archive.set_aside([name], f"a {how} of {shown(whole)}")
+        archive.told([*found, *unusable])
         left = leftovers(archive)
     if not found:
         raise next(iter(unusable.values()))
@@ -170,6 +176,10 @@ def _clip_names(archive: CaptureArchive) -> list[str]:
 def _clip(name: str, checked: Checked, options: IngestOptions) -> Clip:
     num_views = options.panorama_views if checked.info.projection else 0
     return Clip(name, checked.start_s, checked.info.as_dict(), num_views)
+
+
+def _is_smaller(clip: Checked, other: Checked) -> bool:
+    return clip.info.width * clip.info.height < other.info.width * other.info.height
 
 
 def _check_length(clips: Sequence[Checked], options: IngestOptions) -> None:

@@ -151,9 +151,10 @@ def container_of(path: Path) -> str:
     return container
 
 
-def untrusted_input(path: Path) -> Any:
+def untrusted_input(path: Path, start_s: float = 0.0) -> Any:
     """An ffmpeg-python input stream that opens a user's file with its own demuxer only.
 
+    start_s: what lies before that time is passed over.
     Raises CaptureError for anything but a video of a known container.
     """
     return ffmpeg.input(
@@ -162,6 +163,7 @@ def untrusted_input(path: Path) -> Any:
         format_whitelist=_FORMATS,
         protocol_whitelist="file,pipe",
         max_alloc=_MAX_ALLOC_BYTES,
+        **({"ss": f"{start_s:.6f}"} if start_s > 0 else {}),
     )
 
 

@@ -109,8 +109,8 @@ def test_a_clip_that_is_damaged_or_there_twice_is_left_out_by_name(tmp_path: Pat
 
 def test_clips_are_as_long_together_as_one_may_be(tmp_path: Path) -> None:
     clips: dict[str, Path | bytes] = {
-        name: make_clip(tmp_path / name, f"testsrc2=s=320x180:r={rate}:d=2")
-        for name, rate in (("a.mp4", 30), ("b.mp4", 25))
+        name: make_clip(tmp_path / name, f"{source}=s=320x180:r=30:d=2")
+        for name, source in (("a.mp4", "testsrc2"), ("b.mp4", "testsrc"))
     }
     with pytest.raises(CaptureError, match="together 4 s long; 3 s") as caught:
         ingested(tmp_path / "job", clips, IngestOptions(max_duration_s=3.0))
@@ -147,3 +147,39 @@ def test_frames_are_shared_among_clips(
 ) -> None:
     given = [Clip("", 0.0, {"duration_s": s, "num_frames": n}) for s, n in clips]
     assert shared_frames(given, wanted) == shares
+
+
+def proxy(film: Path, path: Path, *options: str) -> Path:
+    """A film again, as a camera or a messenger makes it smaller."""
+    ffmpeg("-i", film, "-an", *options, "-f", "mp4", path)
+    return path
+
+
+@pytest.mark.parametrize("fps", ["30", "15"])
+def test_the_small_proxy_of_a_film_is_no_second_clip(tmp_path: Path, fps: str) -> None:
+    """GoPro's .LRV and DJI's .LRF hold the film beside them reduced, perhaps at half its rate."""
+    film = make_clip(tmp_path / "GX010001.MP4", "testsrc2=s=640x360:r=30:d=3")
+    small = proxy(film, tmp_path / "GL010001.LRV", "-vf", f"scale=160:90,fps={fps}", "-crf", "30")
+    files: dict[str, Path | bytes] = {"DCIM/GL010001.LRV": small, "DCIM/GX010001.MP4": film}
+    summary = ingested(tmp_path / "job", files)
+    assert [clip["name"] for clip in summary["clips"]] == ["DCIM/GX010001.MP4"]
+    told = "\n".join(summary["warnings"])
+    assert "1 video (DCIM/GL010001.LRV) was not used: a smaller copy of DCIM/GX010001.MP4." in told
+
+
+def test_a_film_beside_its_reencoded_copy_is_one(tmp_path: Path) -> None:
+    film = make_clip(tmp_path / "a.mp4", "testsrc2=s=320x180:r=30:d=3", "-crf", "12")
+    again = proxy(film, tmp_path / "b.mp4", "-vf", "eq=brightness=.05:contrast=1.1", "-crf", "35")
+    summary = ingested(tmp_path / "job", {"1 sent.mp4": again, "2 filmed.mp4": film})
+    assert [clip["name"] for clip in summary["clips"]] == ["2 filmed.mp4"]
+    assert any("a copy of 2 filmed.mp4" in warning for warning in summary["warnings"])
+
+
+def test_films_of_one_length_that_show_other_things_are_several(tmp_path: Path) -> None:
+    """Also two rounds of a turntable before one ground: the same but for where the thing is."""
+    turn = "color=gray:s=320x180:r=30:d=3[g];testsrc2=s=90x90:r=30:d=3[t];[g][t]overlay=x={}:y=40"
+    first = make_clip(tmp_path / "a.mp4", turn.format("20+2*n"))
+    second = make_clip(tmp_path / "b.mp4", turn.format("20+2*mod(n+45\\,90)"))
+    other = make_clip(tmp_path / "c.mp4", "testsrc2=s=320x180:r=30:d=3")
+    files: dict[str, Path | bytes] = {"a.mp4": first, "b.mp4": second, "c.mp4": other}
+    assert ingested(tmp_path / "job", files)["num_clips"] == 3
