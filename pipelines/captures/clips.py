@@ -82,7 +82,9 @@ def read_films(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
     found: dict[str, Checked] = {}
     unusable: dict[str, CaptureError] = {}
     target = ctx.out / _CLIP_FILE
-    with CaptureArchive(path, ArchiveLimits(options.max_unpacked_bytes)) as archive:
+    with CaptureArchive(
+        path, ArchiveLimits(max_unpacked_bytes=options.max_unpacked_bytes)
+    ) as archive:
         names = _clip_names(archive)
         for done, name in enumerate(names):
             archive.copy(name, target)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from pipelines.captures.archive_rules import ArchiveLimits
 from pipelines.captures.clips import Clip
 from pipelines.captures.sniff import sniff
 from pipelines.errors import CaptureError
@@ -183,3 +185,14 @@ def test_films_of_one_length_that_show_other_things_are_several(tmp_path: Path) 
     other = make_clip(tmp_path / "c.mp4", "testsrc2=s=320x180:r=30:d=3")
     files: dict[str, Path | bytes] = {"a.mp4": first, "b.mp4": second, "c.mp4": other}
     assert ingested(tmp_path / "job", files)["num_clips"] == 3
+
+
+def test_a_raised_limit_of_unpacked_bytes_is_heeded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where archives may have a thousand bytes by default, films of more go by the option."""
+    limits = ArchiveLimits(max_unpacked_bytes=1000)
+    monkeypatch.setattr(ArchiveLimits.__init__, "__defaults__", astuple(limits))
+    film = make_clip(tmp_path / "a.mp4")
+    raised = IngestOptions(max_unpacked_bytes=2**20)
+    assert ingested(tmp_path / "job", {"a.mp4": film}, raised)["num_clips"] == 1
