@@ -59,7 +59,8 @@ def film_copies(
         if (name, step_s) not in known:
             extract(name, scratch)
             try:
-                known[name, step_s] = _looks(scratch, look_times(clips[name], step_s), ctx)
+                times_s = look_times(clips[name], step_s)
+                known[name, step_s] = _looks(scratch, clips[name].info.stream, times_s, ctx)
             finally:
                 scratch.unlink(missing_ok=True)
         return known[name, step_s]
@@ -113,24 +114,26 @@ def _nearest(times_s: Sequence[float], wanted_s: float) -> float:
     return min(times_s[max(place - 1, 0) : place + 1], key=lambda each: abs(each - wanted_s))
 
 
-def _looks(path: Path, times_s: Sequence[float], ctx: StageContext) -> list[Look | None]:
-    """What a clip shows at these times, [_LOOK_PX, _LOOK_PX] each; None where that is not to be
-    decoded."""
+def _looks(
+    path: Path, stream: str, times_s: Sequence[float], ctx: StageContext
+) -> list[Look | None]:
+    """What a stream of a clip shows at these times, [_LOOK_PX, _LOOK_PX] each; None where that is
+    not to be decoded."""
     looks: list[Look | None] = []
     for time_s in times_s:
         ctx.check_cancelled()
         data: list[bytes] = []
         # Just before the frame: times are rounded, and the first frame from there on is taken.
-        stream = untrusted_input(path, start_s=max(time_s - 0.002, 0.0)).output(
+        one = untrusted_input(path, start_s=max(time_s - 0.002, 0.0)).output(
             "pipe:1",
-            map="0:V:0",
+            map=stream,
             f="rawvideo",
             vf=f"scale={_LOOK_PX}:{_LOOK_PX}:flags=area,format=gray",
             **{"frames:v": 1, "an": None, "sn": None, "dn": None},
         )
         try:
             run_ffmpeg(
-                stream,
+                one,
                 time_limit_s=_LOOK_LIMIT_S,
                 is_cancelled=ctx.is_cancelled,
                 on_stdout=data.append,

@@ -71,7 +71,9 @@ class FilmFrames:
                     code="too_large",
                     hint="Record at a smaller size.",
                 )
-            plan = DecodePlan(info.width, info.height, str(info.hdr), info.matrix)
+            plan = DecodePlan(
+                info.width, info.height, str(info.hdr), info.matrix, stream=info.stream
+            )
             num_decoded = decode(film, plan, ctx, keep)
         except ToolError as error:
             if error.code == "tool_timeout":

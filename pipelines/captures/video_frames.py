@@ -102,6 +102,7 @@ class DecodePlan:
     the colour matrix to assume, or None for the one that the video names.
     step_s: at most one frame is delivered per cell of this length (from `start_s` on); 0 for all.
     crop: the part of the upright, unreduced frames that is taken; None for all.
+    stream: as in `VideoInfo`.
     """
 
     width: int
@@ -111,6 +112,7 @@ class DecodePlan:
     start_s: float = 0.0
     step_s: float = 0.0
     crop: Crop | None = None
+    stream: str = "0:V:0"
 
 
 def reduced_size(width: int, height: int, long_side_px: int) -> tuple[int, int]:
@@ -230,7 +232,7 @@ def decode(
             write_pq_table(pq_table)
         stream = untrusted_input(path).output(
             "pipe:1",
-            map="0:V:0",
+            map=plan.stream,
             f="rawvideo",
             vf=filter_chain(plan, pq_table),
             **passthrough_timing(),

@@ -334,6 +334,7 @@ def _decode_clip(
         start_s=clip.start_s,
         step_s=_step(clip, share * options.candidates_per_frame),
         crop=crop,
+        stream=clip.video["stream"],
     )
 
     def on_frame(frame: Frame) -> None:

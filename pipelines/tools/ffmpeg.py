@@ -56,6 +56,7 @@ class VideoInfo:
     matrix: where the file does not name its colour matrix, ffmpeg's name of the one to assume.
     projection: ffmpeg's name of a 360-degree projection, such as "equirectangular"; "" for none.
     num_frames: None unless counted.
+    stream: ffmpeg's name of the stream that is the film.
     """
 
     container: str
@@ -71,6 +72,7 @@ class VideoInfo:
     matrix: str | None = None
     projection: str = ""
     num_frames: int | None = None
+    stream: str = "0:V:0"
 
     def as_dict(self) -> dict[str, Any]:
         """As plain JSON, for `capture.json`."""
@@ -227,7 +229,7 @@ def parse_probe(container: str, lines: Sequence[str]) -> VideoInfo:
             code="video_undecodable",
             hint="Check that it plays, or export it again as MP4 (H.264 or HEVC).",
         )
-    stream, side_data = _video_stream(lines)
+    specifier, stream, side_data = _video_stream(lines)
     codec, pix_fmt, color, width, height = _picture(stream)
     rotation = _rotation(side_data)
     width, height = _square_pixels(stream, width, height)
@@ -247,31 +249,45 @@ def parse_probe(container: str, lines: Sequence[str]) -> VideoInfo:
         color=color,
         matrix=_assumed_matrix(pix_fmt, color, width, height) if hdr == "none" else None,
         projection=_projection(side_data),
+        stream=specifier,
     )
 
 
-def _video_stream(lines: Sequence[str]) -> tuple[str, str]:
-    """The line of the first video stream that is no cover picture, and the lines below it."""
-    start = next(
-        (
-            number
-            for number, line in enumerate(lines)
-            if re.match(r"\s+Stream #0:\d+.*: Video: ", line) and "(attached pic)" not in line
-        ),
-        None,
-    )
-    if start is None:
+def _video_stream(lines: Sequence[str]) -> tuple[str, str, str]:
+    """ffmpeg's name of the video stream that is the film, its line, and the lines below it.
+
+    That is the largest one, the first of several as large: cameras keep a preview beside the film.
+    Cover pictures and thumbnails are none. Raises CaptureError no_video_stream.
+    """
+    found = [
+        (match.group(1), number)
+        for number, line in enumerate(lines)
+        if (match := re.match(r"\s+Stream #(0:\d+).*: Video: ", line))
+        and "(attached pic)" not in line
+        and "(timed thumbnails)" not in line
+    ]
+    if not found:
         raise CaptureError(
             "The file has no video stream.",
             code="no_video_stream",
             hint="Send a file with pictures in it; this one holds sound or data only.",
         )
+    specifier, start = max(found, key=lambda item: _num_pixels(lines[item[1]]))
     below = []
     for line in lines[start + 1 :]:
         if re.match(r"\s+Stream #|\s*Stream mapping|Output #|At least one output", line):
             break
         below.append(line)
-    return lines[start], "\n".join(below)
+    return specifier, lines[start], "\n".join(below)
+
+
+def _num_pixels(stream: str) -> int:
+    """Of a stored frame; 0 where it cannot be decoded."""
+    try:
+        *_, width, height = _picture(stream)
+    except CaptureError:
+        return 0
+    return width * height
 
 
 def _split(description: str) -> list[str]:

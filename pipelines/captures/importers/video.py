@@ -39,8 +39,11 @@ class Scan:
     is_cut_off: bool
 
 
-def scan(path: Path, ctx: StageContext) -> Scan:
-    """Walk through all packets of the video stream. Raises ToolError where that fails."""
+def scan(path: Path, ctx: StageContext, stream: str = "0:V:0") -> Scan:
+    """Walk through all packets of a video stream, as `VideoInfo` names it.
+
+    Raises ToolError where that fails.
+    """
     times: list[int] = []
     ends: list[int] = []
     unit: list[float] = []
@@ -60,11 +63,11 @@ def scan(path: Path, ctx: StageContext) -> Scan:
                 times.append(_ticks(pts, dts, default=max(ends, default=0)))
                 ends.append(times[-1] + int(duration))
 
-    stream = untrusted_input(path).output(
-        "pipe:1", map="0:V:0", c="copy", f="framecrc", **{"an": None, "sn": None, "dn": None}
+    copied = untrusted_input(path).output(
+        "pipe:1", map=stream, c="copy", f="framecrc", **{"an": None, "sn": None, "dn": None}
     )
     run_ffmpeg(
-        stream,
+        copied,
         log_level="warning",
         time_limit_s=_SCAN_LIMIT_S,
         is_cancelled=ctx.is_cancelled,
@@ -125,7 +128,7 @@ def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int
     info = _with_projection(info, options)
     ctx.progress(0.1, "Looking for the end of the video")
     try:
-        packets = scan(path, ctx)
+        packets = scan(path, ctx, info.stream)
     except ToolError as error:
         if error.code == "tool_timeout":
             raise
@@ -137,7 +140,7 @@ def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int
             hint="Upload the file again; it was not copied or recorded to its end.",
         )
     ctx.progress(0.7, "Decoding the first frames")
-    _try_decoding(path, ctx)
+    _try_decoding(path, ctx, info.stream)
     num_frames = len(packets.times_s)
     if num_frames < max(minimum, 1):
         raise CaptureError(
@@ -215,18 +218,18 @@ def _warnings(info: VideoInfo) -> list[str]:
     return warnings
 
 
-def _try_decoding(path: Path, ctx: StageContext) -> None:
+def _try_decoding(path: Path, ctx: StageContext, stream: str) -> None:
     """Decode the first frames. Raises CaptureError video_undecodable."""
     seen: list[bytes] = []
-    stream = untrusted_input(path).output(
+    decoded = untrusted_input(path).output(
         "pipe:1",
-        map="0:V:0",
+        map=stream,
         f="framecrc",
         **{"frames:v": _FRAMES_TRIED, "an": None, "sn": None, "dn": None},
     )
     try:
         run_ffmpeg(
-            stream,
+            decoded,
             time_limit_s=_DECODE_LIMIT_S,
             is_cancelled=ctx.is_cancelled,
             on_stdout=seen.append,

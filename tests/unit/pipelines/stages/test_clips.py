@@ -196,3 +196,16 @@ def test_a_raised_limit_of_unpacked_bytes_is_heeded(
     film = make_clip(tmp_path / "a.mp4")
     raised = IngestOptions(max_unpacked_bytes=2**20)
     assert ingested(tmp_path / "job", {"a.mp4": film}, raised)["num_clips"] == 1
+
+
+def test_frames_are_those_of_the_film_not_of_a_preview_before_it(tmp_path: Path) -> None:
+    """Some cameras keep a small preview in the same file, as its first stream."""
+    preview = make_clip(tmp_path / "small.mp4", "color=red:s=160x90:r=15:d=3")
+    film = numbered_clip(tmp_path, "film", 0, 60, 20)
+    both = tmp_path / "both.mov"
+    ffmpeg("-i", preview, "-i", film, "-map", "0:v", "-map", "1:v", "-c", "copy", both)
+    summary = ingested(tmp_path / "job", {"both.mov": both})
+    assert [clip["width"] for clip in summary["clips"]] == [320]
+    _, listed, out = chosen(tmp_path / "job", num_frames=20)
+    for row in listed["frames"]:
+        assert number_in(out / row["file"]) == row["source_frame_index"]

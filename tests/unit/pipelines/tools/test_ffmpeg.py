@@ -76,6 +76,23 @@ def test_probe_reads_the_words_of_release_9_and_skips_cover_pictures() -> None:
     assert (info.width, info.height, info.rotation_deg, info.hdr) == (180, 320, 270, "pq")
 
 
+def test_the_film_is_the_largest_stream_not_a_preview_before_it(tmp_path: Path) -> None:
+    small = make_clip(tmp_path / "small.mp4", "testsrc=s=160x90:r=15:d=1")
+    film = make_clip(tmp_path / "film.mp4", "testsrc2=s=320x180:r=30:d=2")
+    both = tmp_path / "both.mp4"
+    ffmpeg("-i", small, "-i", film, "-map", "0:v", "-map", "1:v", "-c", "copy", both)
+    info = probe(both)
+    assert (info.width, info.height, info.stream) == (320, 180, "0:1")
+    ffmpeg("-i", film, "-i", film, "-map", "0:v", "-map", "1:v", "-c", "copy", both)
+    assert probe(both).stream == "0:0"  # of several as large the first
+
+
+def test_a_larger_cover_picture_is_not_the_film() -> None:
+    large = PHONE_9.replace("100x100", "3000x3000")
+    info = parse_probe("mov", large.splitlines())
+    assert (info.width, info.height, info.stream) == (180, 320, "0:1")
+
+
 def test_dolby_vision_without_a_base_layer_is_told() -> None:
     plain = PHONE_5.replace("arib-std-b67", "unknown").replace("profile: 8", "profile: 5")
     assert parse_probe("mov", plain.splitlines()).hdr == "dolby"
