@@ -18,13 +18,14 @@ from scipy.sparse.csgraph import connected_components
 from pipelines.exports.crop import Crop
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.subject import Thing
-from pipelines.exports.texture.charts import MARGIN_PX, shelves
+from pipelines.exports.texture.charts import MARGIN_PX
+from pipelines.exports.texture.packing import outlines_of, smallest
+from pipelines.exports.texture.texels import fill
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 AnyMesh = TriangleMesh | TexturedMesh
 
-_LEAST_TEXTURE_PX = 256
 _CRUMB = 0.01
 _FLAT = 1e-12
 """Area of a triangle, in squares of the box's longest side, below which it is a line."""
@@ -87,32 +88,21 @@ def without_crumbs(mesh: AnyMesh, least_share: float) -> AnyMesh:
 
 def with_own_texture(mesh: TexturedMesh) -> TexturedMesh:
     """The same look with a texture that holds what the mesh uses, if that is smaller."""
-    side = len(mesh.texture)
-    charts = _pieces(mesh.faces)
-    count = int(charts.max()) + 1
+    height, width = mesh.texture.shape[:2]
     chart_of = np.zeros(len(mesh.vertices), np.int32)
-    chart_of[mesh.faces.reshape(-1)] = np.repeat(charts, 3)
-    places = mesh.uv * (mesh.texture.shape[1], side)
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, chart_of, places)
-    np.maximum.at(high, chart_of, places)
-    start = np.maximum(np.floor(low) - MARGIN_PX, 0).astype(np.int32)
-    end = np.minimum(np.ceil(high) + MARGIN_PX, mesh.texture.shape[1::-1]).astype(np.int32)
-    smaller = _LEAST_TEXTURE_PX
-    while smaller < side:
-        target = shelves((end - start).astype(np.float64), smaller)
-        if target is not None:
-            break
-        smaller *= 2
-    else:
+    chart_of[mesh.faces.reshape(-1)] = np.repeat(_pieces(mesh.faces), 3)
+    places = mesh.uv * (width, height)
+    outlines = outlines_of(places, mesh.faces, chart_of, MARGIN_PX)
+    packing = smallest(outlines, max(width, height), width * height - 1)
+    if packing is None:
         return mesh
-    ground = mesh.texture.reshape(-1, 3).mean(axis=0)
-    texture = np.empty((smaller, smaller, 3), np.uint8)
-    texture[:] = np.rint(ground).astype(np.uint8)
-    for (left, top), (right, bottom), (x, y, x_end, y_end) in zip(start, end, target, strict=True):
-        texture[y:y_end, x:x_end] = mesh.texture[top:bottom, left:right]
-    moved = places - start[chart_of] + target[chart_of, :2]
-    return replace(mesh, uv=moved / smaller, texture=texture)
+    texture = np.zeros((packing.size[1], packing.size[0], 3), np.uint8)
+    known = np.zeros(texture.shape[:2], np.bool_)
+    for chart in range(len(outlines.size)):
+        known[packing.lay(chart, mesh.texture, texture)] = True
+    fill(texture, known)
+    uv = packing.moved(places, chart_of) / packing.size
+    return replace(mesh, uv=uv, texture=texture)
 
 
 def _values(mesh: AnyMesh) -> Floats:

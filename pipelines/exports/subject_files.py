@@ -61,7 +61,7 @@ def save_subject(
     return {
         "file": SUBJECT,
         "num_faces": len(cut.faces),
-        "texture_px": len(cut.texture) if isinstance(cut, TexturedMesh) else None,
+        "texture_px": max(cut.texture.shape) if isinstance(cut, TexturedMesh) else None,
     }
 
 

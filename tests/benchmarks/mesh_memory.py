@@ -115,7 +115,8 @@ def painted(texture_px: int, watch: Watch) -> str:
         photos = Photos(Path(folder), images, [lens] * len(images))
         watch(0.0)
         made = texture_from_photos(mesh, photos, texture_px, watch)
-    return f"{len(mesh.faces):,} faces, a picture of {len(made.texture)} px"
+    height, width = made.texture.shape[:2]
+    return f"{len(mesh.faces):,} faces, a picture of {width} x {height} px"
 
 
 def decimated(triangles: int, watch: Watch) -> str:

@@ -3,7 +3,9 @@
 Vertex colours cannot be finer than triangles are; photos are. Each face takes its colours from one
 photo, which keeps them sharp; brightness is levelled across the seams, and in the end all photos
 that see a place have a say (`pipelines.exports.texture.refining`). Faces that no photo shows
-keep their vertices' colours. Memory: one photo at a time and the picture itself.
+keep their vertices' colours, on charts of their own. What of the picture lies on no face goes on
+with the colours of the faces beside it, as viewers mix it in from afar. Memory: one photo at a time
+and the picture itself.
 """
 
 from __future__ import annotations
@@ -17,13 +19,16 @@ from PIL import Image
 
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.options import TextureOptions
-from pipelines.exports.texture.charts import CELL_PX, Charts, Layout, TextureFull, cut, lay_out
+from pipelines.exports.texture.alone import Gradients, gradient_density
+from pipelines.exports.texture.charts import MARGIN_PX, Charts, Layout, cut, lay_out
 from pipelines.exports.texture.choice import NOBODY, Surface, choose_photos
 from pipelines.exports.texture.field import pixels_on, seen_from, texture_from_field
 from pipelines.exports.texture.levelling import levels
+from pipelines.exports.texture.packing import TextureFull
 from pipelines.exports.texture.photos import Photos, colors_at, softened
 from pipelines.exports.texture.refining import refine
-from pipelines.exports.texture.texels import ROWS, moving, spread, texels_of
+from pipelines.exports.texture.texels import ROWS, fill, moving, spread, texels_of
+from pipelines.exports.texture.unwrap import laid_flat
 from pipelines.exports.void import void_of_photos
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
 from pipelines.scene.trained_scene import TrainedScene
@@ -36,8 +41,8 @@ _CHOICE_SHARE, _CUT_SHARE, _COPY_SHARE = 0.35, 0.4, 0.5
 _LEVEL_SHARE, _ADD_SHARE = 0.52, 0.55
 _MOST_POLLS = 1000
 """Of what solves for the corners' levels, about."""
+_REFINE_SHARE = 0.98
 _LOOK_SHARE = 0.1
-_SPREAD_PX = 3
 
 
 def painted(
@@ -104,55 +109,59 @@ def texture_from_photos(
     surface = Surface(vertices, mesh.faces, mesh.normals)
     choice = choose_photos(surface, photos, lambda done: on_progress(_CHOICE_SHARE * done))
 
-    def places(index: int, which: NDArray[np.int32]) -> Floats:
+    def poll() -> None:
         on_progress(_CHOICE_SHARE)
+
+    def places(index: int, which: NDArray[np.int32]) -> Floats:
+        poll()
         return photos.pixels(index, vertices[which])[0]
 
-    charts = cut(mesh.faces, choice, places)
-    layout = lay_out(charts, photos.size, largest_side)
+    def flat(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], Floats]:
+        found = laid_flat(vertices, faces, gradient_density(vertices, faces, photos), poll)
+        return found.face_chart, found.place
+
+    charts = cut(mesh.faces, choice, places, flat)
+    layout = lay_out(charts, photos.size, largest_side, poll)
     on_progress(_CUT_SHARE)
-    # Smaller copies of the texture mix in what lies beside a patch: nothing there is dark.
-    ground = np.rint(255.0 * np.clip(mesh.colors.mean(axis=0), 0.0, 1.0)).astype(np.uint8)
     picture, colors = _copied(
         charts,
         layout,
         photos,
-        ground,
         lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
     )
     added = levels(charts, colors, moving(on_progress, _COPY_SHARE, _LEVEL_SHARE, _MOST_POLLS))
-    own: NDArray[np.floating[Any]] = mesh.colors
-    calls = layout.side // ROWS + 4 * _SPREAD_PX
+    calls = -(-layout.size[1] // ROWS) + 4 * MARGIN_PX
     told = moving(on_progress, _LEVEL_SHARE, _ADD_SHARE, calls)
-    covered = _level(picture, charts, layout, added, told)
+    known = _level(picture, charts, layout, added, told)
+    spread(picture, known, MARGIN_PX, told)
+    gradients = Gradients(charts, layout)
+    known[gradients.rows, gradients.columns] = True
+    own: NDArray[np.floating[Any]] = mesh.colors
+    gradients.paint(picture, own[charts.vertex])
+    fill(picture, known)
     if refined:
         own = refine(
-            *(picture, covered, own, surface, charts, layout, photos),
-            lambda done: on_progress(_ADD_SHARE + (1.0 - _ADD_SHARE) * done),
+            *(picture, own, surface, charts, layout, photos),
+            lambda done: on_progress(_ADD_SHARE + (_REFINE_SHARE - _ADD_SHARE) * done),
         )
-    _fill_cells(picture, charts, layout, own[charts.vertex])
+        gradients.paint(picture, own[charts.vertex])
+        fill(picture, known)
     on_progress(1.0)
     return TexturedMesh(
         vertices=mesh.vertices[charts.vertex],
         faces=charts.faces,
         normals=mesh.normals[charts.vertex],
-        uv=layout.uv / layout.side,
+        uv=layout.uv / layout.size,
         texture=picture,
     )
 
 
 def _copied(
-    charts: Charts,
-    layout: Layout,
-    photos: Photos,
-    ground: Bytes,
-    on_progress: Callable[[float], None],
+    charts: Charts, layout: Layout, photos: Photos, on_progress: Callable[[float], None]
 ) -> tuple[Bytes, Floats]:
-    """The patches in their places, and each corner's colour in its photo, [U, 3].
-
-    ground: [3], what is where no patch is.
-    """
-    picture = np.broadcast_to(ground, (layout.side, layout.side, 3)).copy()
+    """The patches in their places, and each corner's colour in its photo, [U, 3]."""
+    width, height = layout.size
+    picture = np.zeros((height, width, 3), np.uint8)
     colors = np.full((len(charts.vertex), 3), np.nan)
     by_photo = charts.photo[layout.charts]
     used = np.unique(by_photo)
@@ -161,15 +170,14 @@ def _copied(
         whole = np.asarray(photo)
         for row in np.flatnonzero(by_photo == index):
             left, top, right, bottom = layout.source[row].tolist()
-            x, y, x_end, y_end = layout.target[row].tolist()
-            size = (x_end - x, y_end - y)
+            size = tuple(layout.scaled[row].tolist())
             if size == (right - left, bottom - top):
                 patch = whole[top:bottom, left:right]
             else:
                 patch = np.asarray(
                     photo.resize(size, Image.Resampling.BOX, (left, top, right, bottom))
                 )
-            picture[y:y_end, x:x_end] = patch
+            layout.packing.lay(int(layout.charts[row]), patch, picture)
         mine = charts.photo[charts.chart] == index
         colors[mine] = colors_at(softened(photo), charts.place[mine])
         on_progress(done / len(used))
@@ -181,39 +189,22 @@ def _level(
 ) -> NDArray[np.bool_]:
     """Add what each corner needs, and between corners what lies between, in place.
 
-    Returns which texels are on faces that a photo shows, [side, side].
+    Returns which texels [H, W] are on faces that a photo shows, or all of a patch with none.
     """
     shown = charts.photo[charts.face_chart] != NOBODY
     covered = np.zeros(picture.shape[:2], np.bool_)
     if not shown.any():
         return covered
-    faces = charts.faces[shown]
-    steps = np.zeros(picture.shape, np.int16)
-    for texels in texels_of(layout.uv, faces, layout.side):
+    faces, chart = charts.faces[shown], charts.face_chart[shown]
+    missed = np.ones(len(charts.photo), np.bool_)
+    for texels in texels_of(layout.uv, faces, layout.size):
         values = np.einsum("nc,ncd->nd", texels.weights, added[faces[texels.face]])
-        values = np.rint(255.0 * values)
-        steps[texels.rows][texels.covered] = np.clip(values, -255, 255).astype(np.int16)
+        moved = picture[texels.rows][texels.covered] + 255.0 * values
+        picture[texels.rows][texels.covered] = np.rint(np.clip(moved, 0.0, 255.0))
         covered[texels.rows] = texels.covered
+        missed[chart[texels.face]] = False
         on_rows()
-    spread(steps, covered.copy(), _SPREAD_PX, on_rows)
-    np.clip(picture + steps, 0, 255, out=steps)
-    picture[:] = steps.astype(np.uint8)
+    for one in layout.charts[missed[layout.charts]].tolist():
+        rows, columns = layout.packing.texels(one)
+        covered[rows, columns] = True
     return covered
-
-
-def _fill_cells(
-    picture: Bytes, charts: Charts, layout: Layout, colors: NDArray[np.floating[Any]]
-) -> None:
-    """Gradients between the corners' own colours [U, 3], for faces that no photo shows."""
-    alone = np.flatnonzero(charts.photo[charts.face_chart] == NOBODY)
-    if len(alone) == 0:
-        return
-    corners = charts.faces[alone]
-    start = np.floor(layout.uv[corners[:, 0]]).astype(int)
-    first, right, below = (colors[corners[:, k]] for k in range(3))
-    reach = CELL_PX - 1
-    for dy in range(CELL_PX):
-        for dx in range(CELL_PX):
-            value = first + (right - first) * (dx / reach) + (below - first) * (dy / reach)
-            texels = np.rint(255.0 * np.clip(value, 0.0, 1.0)).astype(np.uint8)
-            picture[start[:, 1] + dy, start[:, 0] + dx] = texels

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pipelines.exports.mesh import Floats, TexturedMesh, TriangleMesh, unit_normals
 from pipelines.exports.surface.sight import Sight
 from pipelines.exports.texture.photos import Photos
-from pipelines.exports.texture.texels import Texels, spread, texels_of
+from pipelines.exports.texture.texels import Texels, fill, spread, texels_of
 from pipelines.exports.texture.unwrap import GUTTER_PX, unwrap
 from pipelines.nerf.renderer import RenderedImage
 from pipelines.scene.cameras_file import Intrinsics, PosedImage
@@ -69,13 +69,12 @@ def texture_from_field(
 
     atlas = unwrap(local, mesh.faces, TEXELS_PER_PIXEL / pixel, largest_side, poll)
     on_progress(_UNWRAP_SHARE)
-    # Smaller copies of the texture mix in what lies beside a chart: nothing there is dark.
-    ground = np.rint(255.0 * np.clip(mesh.colors.mean(axis=0), 0.0, 1.0)).astype(np.uint8)
-    picture = np.broadcast_to(ground, (atlas.side, atlas.side, 3)).copy()
+    width, height = atlas.size
+    picture = np.zeros((height, width, 3), np.uint8)
     covered = np.zeros(picture.shape[:2], np.bool_)
     surface = _Surface(local, mesh, toward, _reaches(local, mesh.faces, pixel, atlas.face_chart))
-    last = max(1.0, min(float(atlas.uv[:, 1].max()) + 1.0, atlas.side))
-    for texels in texels_of(atlas.uv, atlas.faces, atlas.side, _ROWS):
+    last = max(1.0, min(float(atlas.uv[:, 1].max()) + 1.0, height))
+    for texels in texels_of(atlas.uv, atlas.faces, atlas.size, _ROWS):
 
         def on_share(done: float, rows: slice = texels.rows) -> None:
             share = min(1.0, (rows.start + done * (rows.stop - rows.start)) / last)
@@ -87,12 +86,13 @@ def texture_from_field(
         picture[texels.rows][texels.covered] = texture
         covered[texels.rows] = texels.covered
     spread(picture, covered, GUTTER_PX, lambda: on_progress(_RENDER_SHARE))
+    fill(picture, covered)
     on_progress(1.0)
     return TexturedMesh(
         vertices=mesh.vertices[atlas.vertex],
         faces=atlas.faces,
         normals=mesh.normals[atlas.vertex],
-        uv=atlas.uv / atlas.side,
+        uv=atlas.uv / atlas.size,
         texture=picture,
     )
 

@@ -19,8 +19,8 @@ from the pixels that show a part of such a face, in the same way.
 Left out are pixels at jumps of depth and at holes, where a pose that is off shows something else,
 masked ones, and what is seen from behind or at a glance.
 
-Symbols: N pixels, S side of the texture, M texels of all the copies, one row after another; V
-vertices.
+Symbols: N pixels, H and W height and width of the texture, M texels of all the copies, one row
+after another; V vertices.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from pipelines.exports.each_view import each_view
-from pipelines.exports.texture.charts import MARGIN_PX, Charts, Layout
+from pipelines.exports.texture.charts import Charts, Layout
 from pipelines.exports.texture.choice import NOBODY, Surface
 from pipelines.exports.texture.photos import Photos
 from pipelines.exports.texture.texels import moving, spread
@@ -64,7 +64,7 @@ _GOLDEN = 0.618
 _CHUNK = 2_000_000
 _SPREAD_PASSES = 2
 _ROWS = 256
-_LOOK_SHARE, _MARGIN_SHARE, _SOLVE_SHARE, _SPREAD_SHARE = 0.5, 0.55, 0.9, 0.94
+_LOOK_SHARE, _SOLVE_SHARE, _SPREAD_SHARE = 0.5, 0.9, 0.94
 
 
 class _Looks(NamedTuple):
@@ -77,7 +77,6 @@ class _Looks(NamedTuple):
 
 def refine(
     picture: Bytes,
-    covered: NDArray[np.bool_],
     colors: NDArray[np.floating[Any]],
     surface: Surface,
     charts: Charts,
@@ -85,19 +84,19 @@ def refine(
     photos: Photos,
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> Floats:
-    """Move a texture [S, S, 3] towards what the photos show, in place; and vertices' colours
+    """Move a texture [H, W, 3] towards what the photos show, in place; and vertices' colours
     [V, 3] in [0, 1] where faces have nothing else: returned.
 
-    covered: [S, S], texels on faces that a photo shows; changed. surface: whose faces are those of
-    the charts, in order. on_progress: told the share that is done; may raise.
+    surface: whose faces are those of the charts, in order. on_progress: told the share that is
+    done; may raise.
     """
-    if layout.side < _LEAST_SIDE:
+    if min(layout.size) < _LEAST_SIDE:
         return colors.astype(np.float32)
     of_texels, of_vertices = _looks(
         surface, charts, layout, photos, lambda done: on_progress(_LOOK_SHARE * done)
     )
     if of_texels:
-        _refine_picture(picture, covered, of_texels, charts, layout, on_progress)
+        _refine_picture(picture, of_texels, on_progress)
     return refined_colors(
         colors.astype(np.float32),
         of_vertices,
@@ -106,33 +105,24 @@ def refine(
 
 
 def _refine_picture(
-    picture: Bytes,
-    covered: NDArray[np.bool_],
-    looks: list[_Looks],
-    charts: Charts,
-    layout: Layout,
-    on_progress: Callable[[float], None],
+    picture: Bytes, looks: list[_Looks], on_progress: Callable[[float], None]
 ) -> None:
     """Move the texture. looks: emptied, as they are large."""
-    # What a patch shows around its faces may lie behind them: at a pixel that mixes both, the face
-    # would make up for it.
-    told = moving(on_progress, _LOOK_SHARE, _MARGIN_SHARE, 4 * MARGIN_PX)
-    spread(picture, covered, MARGIN_PX, told)
-    half = layout.side // 2
-    begun = np.empty((half, half, 3), np.float32)
+    half, width = (side // 2 for side in picture.shape[:2])
+    begun = np.empty((half, width, 3), np.float32)
     for top in range(0, half, _ROWS):
         rows = picture[2 * top : 2 * min(top + _ROWS, half)].astype(np.float32)
         begun[top : top + _ROWS] = _halved(rows) / np.float32(255.0)
     step, known = solved(
         begun,
         looks,
-        lambda done: on_progress(_MARGIN_SHARE + (_SOLVE_SHARE - _MARGIN_SHARE) * done),
+        lambda done: on_progress(_LOOK_SHARE + (_SOLVE_SHARE - _LOOK_SHARE) * done),
     )
     looks.clear()
     del begun
     told = moving(on_progress, _SOLVE_SHARE, _SPREAD_SHARE, 4 * _SPREAD_PASSES)
     spread(step, known, _SPREAD_PASSES, told)
-    _add(picture, step, _last_row(charts, layout))
+    _add(picture, step)
 
 
 def solved(
@@ -140,21 +130,21 @@ def solved(
     looks: Sequence[tuple[csr_array, Bytes]],
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """What to add to a texture [T, T, 3] in [0, 1], and where that is known, [T, T].
+    """What to add to a texture [H, W, 3] in [0, 1], and where that is known, [H, W].
 
     looks: pixels in several parts, each a matrix [N, M] with rows that sum to 1, and colours
     [N, 3]; M texels of the texture and its copies, as `copies_of` has them.
     """
-    side = len(begun)
+    shape = len(begun), begun.shape[1]
     texture = begun.copy()
-    known = np.zeros((side, side), np.bool_)
+    known = np.zeros(shape, np.bool_)
     for turn in range(_ROUNDS):
         texels = copies_of(texture)
         missed = np.zeros((len(texels), 4), np.float32)
         for done, (seen, color) in enumerate(looks):
             missed += _missed(seen, color, texels)
             on_progress((turn + (done + 1) / len(looks)) / _ROUNDS)
-        mean = _gathered(missed, side)
+        mean = _gathered(missed, shape)
         held = mean[..., :3] + np.float32(_KEEP) * (begun - texture)
         texture += held / (mean[..., 3:] + np.float32(_KEEP))
         known |= mean[..., 3] > 0.0
@@ -192,26 +182,28 @@ def _missed(seen: csr_array, color: Bytes, texels: Floats) -> Floats:
 
 
 def copies_of(texture: Floats) -> Floats:
-    """Texels of a texture [T, T, 3] and of its smaller copies, [M, 3], as viewers make these."""
+    """Texels of a texture [H, W, 3] and of its smaller copies, [M, 3], as viewers make these."""
     levels = [texture]
     while len(levels) < _COPIES:
         levels.append(_halved(levels[-1]))
     return np.concatenate([level.reshape(-1, 3) for level in levels])
 
 
-def mixing(places: NDArray[np.float64], level: NDArray[np.integer], side: int) -> csr_array:
+def mixing(
+    places: NDArray[np.float64], level: NDArray[np.integer], shape: tuple[int, int]
+) -> csr_array:
     """Pixels as mixtures of four texels each, [N, M].
 
-    places: [N, 2], in texels of the finest of the copies, of side [side]. level: [N], from 0, the
+    places: [N, 2], in texels of the finest of the copies, of shape (H, W). level: [N], from 0, the
     copy that each pixel asks.
     """
-    sides = side >> level
-    at = np.clip(places / (1 << level)[:, None] - 0.5, 0.0, (sides - 1.0)[:, None])
-    first = np.minimum(at.astype(np.int64), (sides - 2)[:, None])
+    sizes = np.array(shape[::-1]) >> level[:, None]
+    at = np.clip(places / (1 << level)[:, None] - 0.5, 0.0, sizes - 1.0)
+    first = np.minimum(at.astype(np.int64), sizes - 2)
     right, down = (at - first).T.astype(np.float32)
-    begins = np.concatenate([[0], np.cumsum([(side >> k) ** 2 for k in range(_COPIES)])])
-    corner = begins[level] + first[:, 1] * sides + first[:, 0]
-    columns = np.stack([corner, corner + 1, corner + sides, corner + sides + 1], axis=1)
+    begins, wide = _begins(shape), sizes[:, 0]
+    corner = begins[level] + first[:, 1] * wide + first[:, 0]
+    columns = np.stack([corner, corner + 1, corner + wide, corner + wide + 1], axis=1)
     left, up = np.float32(1.0) - right, np.float32(1.0) - down
     values = np.stack([left * up, right * up, left * down, right * down], axis=1)
     return csr_array(
@@ -237,7 +229,8 @@ def _looks(
     painted = charts.photo[charts.face_chart] != NOBODY
     sizes = [photos.glance_size(index, _SIDE) for index in range(len(photos))]
     stride = max(1, -(-sum(width * height for width, height in sizes) // _PIXELS))
-    texels = _Waiting(lambda places, level: mixing(places, level, layout.side // 2))
+    half = layout.size[1] // 2, layout.size[0] // 2
+    texels = _Waiting(lambda places, level: mixing(places, level, half))
     vertices = _Waiting(lambda which, weights: _of_corners(which, weights, len(surface.vertices)))
 
     def look(index: int) -> tuple[tuple[Any, Any, Bytes], tuple[Any, Any, Bytes]]:
@@ -348,14 +341,22 @@ def _density(surface: Surface, charts: Charts, layout: Layout) -> Floats:
     return density
 
 
-def _gathered(sums: Floats, side: int) -> Floats:
-    """Sums at the texels of all copies [M, 4], brought to the finest ones' [side, side, 4].
+def _begins(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Where the texels of each copy begin among those of all, and where they end."""
+    height, width = shape
+    counts = [(height >> k) * (width >> k) for k in range(_COPIES)]
+    return np.concatenate([[0], np.cumsum(counts)])
+
+
+def _gathered(sums: Floats, shape: tuple[int, int]) -> Floats:
+    """Sums at the texels of all copies [M, 4], brought to the finest ones' [H, W, 4].
 
     A texel of a copy is the mean of four, so each of these has a quarter of what it has.
     """
-    begins = np.concatenate([[0], np.cumsum([(side >> k) ** 2 for k in range(_COPIES)])])
+    height, width = shape
+    begins = _begins(shape)
     parts = [
-        sums[begins[k] : begins[k + 1]].reshape(side >> k, side >> k, 4) for k in range(_COPIES)
+        sums[begins[k] : begins[k + 1]].reshape(height >> k, width >> k, 4) for k in range(_COPIES)
     ]
     total = parts[-1]
     for part in reversed(parts[:-1]):
@@ -372,18 +373,13 @@ def _halved(picture: Floats) -> Floats:
     return mean
 
 
-def _last_row(charts: Charts, layout: Layout) -> int:
-    """Where the cells of faces without a photo begin: they keep their vertices' colours."""
-    alone = charts.photo[charts.chart] == NOBODY
-    return int(layout.uv[alone, 1].min()) if alone.any() else layout.side
-
-
-def _add(picture: Bytes, step: Floats, last_row: int) -> None:
-    """Add a step [S / 2, S / 2, 3], between its texels what lies between, above a row."""
-    for top in range(0, last_row, 2 * _ROWS):
-        bottom = min(top + 2 * _ROWS, last_row)
+def _add(picture: Bytes, step: Floats) -> None:
+    """Add a step [H / 2, W / 2, 3], between its texels what lies between."""
+    height, width = picture.shape[:2]
+    for top in range(0, height, 2 * _ROWS):
+        bottom = min(top + 2 * _ROWS, height)
         rows = np.arange(top, bottom)
-        between = _between(_between(step, rows, 0), np.arange(len(picture)), 1)
+        between = _between(_between(step, rows, 0), np.arange(width), 1)
         moved = picture[top:bottom] + np.float32(255.0) * between
         picture[top:bottom] = np.rint(np.clip(moved, 0.0, 255.0)).astype(np.uint8)
 

@@ -10,17 +10,27 @@ from pipelines.exports.mesh import Floats, TexturedMesh, TriangleMesh
 
 
 def skin_told(skin: TriangleMesh | TexturedMesh) -> dict[str, Any]:
-    """Of a delivered mesh: how many faces, the side of its picture, and how fine that is.
+    """Of a delivered mesh: how many faces, how large its picture is, and how fine.
 
-    texels_per_unit: texels along one unit of the world on the middle one of the faces.
+    texture_px: the longer side of its picture. texture_size_px: width and height. texture_filled:
+    the share of it that is on faces. texels_per_unit: texels along one unit of the world on the
+    middle one of the faces.
     """
     if not isinstance(skin, TexturedMesh):
-        return {"texture_px": None, "texels_per_unit": None, "num_faces": len(skin.faces)}
-    lengths = _twice_area(skin.vertices[skin.faces])
-    flat = np.pad(len(skin.texture) * skin.uv, ((0, 0), (0, 1)))
-    density = np.sqrt(_twice_area(flat[skin.faces]) / np.maximum(lengths, 1e-300))
+        return {
+            "texture_px": None,
+            "texture_size_px": None,
+            "texture_filled": None,
+            "texels_per_unit": None,
+            "num_faces": len(skin.faces),
+        }
+    height, width = skin.texture.shape[:2]
+    flat = _twice_area(np.pad(skin.uv * (width, height), ((0, 0), (0, 1)))[skin.faces])
+    density = np.sqrt(flat / np.maximum(_twice_area(skin.vertices[skin.faces]), 1e-300))
     return {
-        "texture_px": len(skin.texture),
+        "texture_px": max(width, height),
+        "texture_size_px": [width, height],
+        "texture_filled": round(float(flat.sum()) / 2.0 / (width * height), 4),
         "texels_per_unit": round(float(np.median(density)), 3),
         "num_faces": len(skin.faces),
     }

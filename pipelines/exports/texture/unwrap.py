@@ -1,4 +1,4 @@
-"""A mesh unwrapped without photos: charts of faces that look one way, flat in one square picture.
+"""A mesh unwrapped without photos: charts of faces that look one way, flat in one picture.
 
 Each face is put to one of 18 directions, the same as its neighbours where that costs little; what
 hangs together is a chart, projected along its direction, so that nothing is stretched by more than
@@ -17,8 +17,9 @@ import numpy as np
 import open3d
 from numpy.typing import NDArray
 
-from pipelines.exports.texture.charts import TextureFull, corners_of, pieces, shelves
+from pipelines.exports.texture.charts import corners_of, pieces
 from pipelines.exports.texture.choice import neighbours_of
+from pipelines.exports.texture.packing import Outlines, outlines_of, packed
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -41,7 +42,6 @@ _OVER_TEXELS = 0.25
 _INSIDE = np.array([[1, 1, 1], [8, 1, 1], [1, 8, 1], [1, 1, 8]], float)
 _INSIDE /= _INSIDE.sum(axis=1, keepdims=True)
 _ANGLES = np.radians(np.arange(0.0, 90.0, 11.25))
-_SHRINK, _LEAST_SCALE = 0.95, 0.01
 
 # open3d's type stubs refuse its own documented calls, so its modules are used untyped.
 _core: Any = open3d.core
@@ -50,14 +50,14 @@ _tensor_geometry: Any = open3d.t.geometry
 
 @dataclass(frozen=True)
 class Atlas:
-    """Where a mesh lies in a square picture. side: of it, px.
+    """Where a mesh lies in a picture. size: width and height of it, px.
 
     faces: [F, 3], corners. vertex: [U], the mesh's vertex of each. uv: [U, 2], px in the picture
     from its top left corner. chart: [U]. face_chart: [F]. scale: texels of the picture for one that
     was wanted, at most 1.
     """
 
-    side: int
+    size: tuple[int, int]
     faces: Ints
     vertex: Ints
     uv: Floats
@@ -72,7 +72,7 @@ class Atlas:
 
 
 @dataclass(frozen=True)
-class _Flat:
+class Flat:
     """Charts that lie flat, each in its own corner of the plane.
 
     place: [U, 2], texels, from 0 in both directions. depth: [U], texels toward who looks at the
@@ -95,12 +95,26 @@ def unwrap(
     largest_side: int,
     poll: Callable[[], None] = lambda: None,
 ) -> Atlas:
-    """Lay out a mesh in the smallest square of a power of two that holds it, or make it fit.
+    """Lay out a mesh in the smallest picture that holds it, or make it fit the largest.
 
     density: [F], texels wanted for a unit of length on each face. largest_side: px, a power of two.
     poll: called every second or so; may raise. Raises TextureFull where not even a hundredth of the
     density fits.
     """
+    flat = laid_flat(vertices, faces, density, poll)
+
+    def outlines_at(scale: float) -> Outlines:
+        return outlines_of(flat.place * scale, flat.faces, flat.chart, GUTTER_PX)
+
+    scale, packing = packed(outlines_at, largest_side, poll)
+    uv = packing.moved(flat.place * scale, flat.chart)
+    return Atlas(packing.size, flat.faces, flat.vertex, uv, flat.chart, flat.face_chart, scale)
+
+
+def laid_flat(
+    vertices: Floats, faces: Ints, density: Floats, poll: Callable[[], None] = lambda: None
+) -> Flat:
+    """Charts of faces that look one way, each by itself. density, poll: as of `unwrap`."""
     across = neighbours_of(faces)
     normals, area = _normals(vertices, faces)
     poll()
@@ -117,7 +131,7 @@ def unwrap(
             break
         # After some turns what is hidden has a chart to itself, in which nothing lies above it.
         layer[hidden] = min(turn + 1, _LAYERS)
-    return _packed(flat, largest_side, poll)
+    return flat
 
 
 def _normals(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
@@ -178,7 +192,7 @@ def _bases() -> tuple[Floats, Floats]:
 
 def _flattened(
     vertices: Floats, faces: Ints, across: Ints, split: Ints, direction: Ints, density: Floats
-) -> _Flat:
+) -> Flat:
     """Connected faces of one split, projected along their direction, in their smallest boxes."""
     face_chart, _ = pieces(across, split)
     cut_faces, vertex, chart = corners_of(faces, face_chart)
@@ -213,22 +227,19 @@ def _flattened(
     mine = tall[chart]
     place[mine] = np.stack([place[mine, 1], size[chart[mine], 0] - place[mine, 0]], axis=1)
     size[tall] = size[tall][:, ::-1]
-    return _Flat(cut_faces, vertex, chart, face_chart, place, depth, size)
+    return Flat(cut_faces, vertex, chart, face_chart, place, depth, size)
 
 
-def _hidden(flat: _Flat) -> NDArray[np.bool_]:
+def _hidden(flat: Flat) -> NDArray[np.bool_]:
     """Faces [F] that must leave their charts so that none lies over another there.
 
     Of two that do, the one behind goes; so does a small one above a large one, which covers none
     of the places that the large one is looked at in.
     """
-    boxes = np.ceil(flat.size) + 2.0
-    side = float(max(np.sqrt(boxes.prod(axis=1).sum()) * 1.5, boxes.max()))
-    while (target := shelves(boxes, int(side))) is None:
-        side *= 1.3
+    target = _apart(np.ceil(flat.size) + 2.0)
     lowest = np.minimum.reduceat(flat.depth, np.flatnonzero(np.diff(flat.chart, prepend=-1)))
     height = flat.depth - lowest[flat.chart]
-    corners = np.concatenate([flat.place + target[flat.chart, :2] + 1.0, height[:, None]], axis=1)
+    corners = np.concatenate([flat.place + target[flat.chart] + 1.0, height[:, None]], axis=1)
     scene = _tensor_geometry.RaycastingScene()
     scene.add_triangles(
         _core.Tensor(corners.astype(np.float32)),
@@ -244,6 +255,23 @@ def _hidden(flat: _Flat) -> NDArray[np.bool_]:
     return hidden
 
 
+def _apart(boxes: Floats) -> Floats:
+    """Left and top [C, 2] of boxes [C, 2] that are to lie beside each other, on shelves."""
+    side = max(np.sqrt(boxes.prod(axis=1).sum()), boxes[:, 0].max())
+    order = np.argsort(-boxes[:, 1], kind="stable")
+    ends = np.cumsum(boxes[order, 0])
+    shelf = (ends // side).astype(np.int64)
+    begins = np.flatnonzero(np.diff(shelf, prepend=-1))
+    heights = np.zeros(len(order))
+    heights[begins[1:]] = np.maximum.reduceat(boxes[order, 1], begins)[:-1]
+    first = np.zeros(len(order))
+    first[begins] = np.diff(ends[begins] - boxes[order[begins], 0], prepend=0.0)
+    target = np.zeros_like(boxes)
+    target[order, 0] = ends - boxes[order, 0] - np.cumsum(first)
+    target[order, 1] = np.cumsum(heights)
+    return target
+
+
 def _first(scene: Any, spots: Floats, start: float, way: float) -> tuple[Floats, NDArray[np.int64]]:
     """The height of the first face on the way through spots [F, K, 3], and which it is."""
     rays = np.zeros((*spots.shape[:2], 6), np.float32)
@@ -253,24 +281,3 @@ def _first(scene: Any, spots: Floats, start: float, way: float) -> tuple[Floats,
     missed = ~np.isfinite(distance)
     height = np.where(missed, spots[..., 2], start + way * np.where(missed, 0.0, distance))
     return height, np.where(missed, np.arange(len(spots))[:, None], face)
-
-
-def _packed(flat: _Flat, largest_side: int, poll: Callable[[], None]) -> Atlas:
-    """The charts in one picture."""
-    side, scale = 256, 1.0
-    while side < largest_side and shelves(_boxes(flat, scale), side) is None:
-        side *= 2
-        poll()
-    while (target := shelves(_boxes(flat, scale), side)) is None:
-        scale *= _SHRINK
-        poll()
-        if scale < _LEAST_SCALE:
-            raise TextureFull(f"{len(flat.size)} charts do not fit into {side} px")
-    uv = flat.place * scale + target[flat.chart, :2] + GUTTER_PX
-    return Atlas(side, flat.faces, flat.vertex, uv, flat.chart, flat.face_chart, scale)
-
-
-def _boxes(flat: _Flat, scale: float) -> Floats:
-    """What charts take up with their gutters, [C, 2] px."""
-    boxes: Floats = np.ceil(flat.size * scale) + 2.0 * GUTTER_PX
-    return boxes

@@ -20,7 +20,7 @@ from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.surface import poisson, poisson_solver, tsdf
 from pipelines.exports.surface.borders import border_loops
 from pipelines.exports.surface.surface_file import SURFACE
-from pipelines.exports.texture import charts
+from pipelines.exports.texture import charts, packing
 from pipelines.judging.asset_views import Texture
 from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
@@ -124,13 +124,15 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
     assert isinstance(painted, TexturedMesh)
     mesh = read_ply(job.stage("mesh") / "mesh.ply")
     assert len(painted.faces) == len(mesh.faces)
-    assert painted.texture.shape[:2] == (summary["texture_px"],) * 2
+    assert list(painted.texture.shape[1::-1]) == summary["texture_size_px"]
+    assert max(summary["texture_size_px"]) == summary["texture_px"]
+    assert 0.1 < summary["texture_filled"] < 1.0
     corners = painted.vertices[painted.faces]
     assert np.abs(corners - mesh.points[mesh.faces]).max() < 1e-4
     for spoil in ({"texture": "none"}, {"texture_px": 512, "max_faces": 100_000}):
         full = "texture_px" in spoil
         if full:
-            monkeypatch.setattr(charts, "_LEAST_SCALE", 1.0)
+            monkeypatch.setattr(packing, "_LEAST_SCALE", 1.0)
             monkeypatch.setattr(charts, "MARGIN_PX", 40)
         plain = tiny_job.run(job, "mesh", **spoil)["summary"]
         assert plain["texture_px"] is None
@@ -148,9 +150,9 @@ def test_every_file_with_a_picture_can_have_it_from_the_field(job: Workspace) ->
     mesh, coarse = read_mesh(folder / "mesh.glb"), read_mesh(folder / "mesh-lod1.glb")
     assert isinstance(mesh, TexturedMesh)
     assert isinstance(coarse, TexturedMesh)
-    assert len(mesh.texture) == told["texture_px"]
+    assert max(mesh.texture.shape) == told["texture_px"]
     assert told["texels_per_unit"] > 10.0
-    assert len(coarse.texture) <= 2048
+    assert max(coarse.texture.shape) <= 2048
     plain = read_ply(folder / "mesh.ply")
     assert plain.colors is not None
     own = plain.colors[plain.faces].mean(axis=1) / 255.0
@@ -339,7 +341,7 @@ def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -
         coarse = read_mesh(job.stage("mesh") / level["file"])
         assert isinstance(coarse, TexturedMesh)
         assert len(coarse.faces) == level["num_faces"] == pytest.approx(triangles / 4, rel=0.1)
-        assert len(coarse.texture) == level["texture_px"]
+        assert max(coarse.texture.shape) == level["texture_px"]
         off = surface.compute_distance(tensor(coarse.vertices.astype(np.float32))).numpy()
         assert np.percentile(off, 95) < 0.02 * size
         triangles = len(coarse.faces)
@@ -367,7 +369,7 @@ def test_every_glb_can_have_its_picture_as_a_ktx2(job: Workspace) -> None:
         found = read_mesh(job.stage("mesh") / name)
         assert isinstance(found, TexturedMesh)
         if name == "mesh.glb":
-            assert len(found.texture) == summary["texture_px"]
+            assert max(found.texture.shape) == summary["texture_px"]
             assert found.texture.std() > 5.0
 
 

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from pipelines.errors import Cancelled
-from pipelines.exports.mesh import TexturedMesh
+from pipelines.exports.mesh import TexturedMesh, TriangleMesh
 from pipelines.exports.texture import bake, texels
 from pipelines.exports.texture.bake import texture_from_photos
+from pipelines.exports.texture.charts import MARGIN_PX
 from pipelines.exports.texture.photos import Photos
+from pipelines.exports.texture.told import skin_told
 from pipelines.exports.void import Void
 from pipelines.judging.asset_views import MeshCaster, Texture
 from pipelines.scene.depth_views import Pinhole
@@ -135,20 +137,68 @@ def test_what_of_a_photo_is_void_colours_nothing(tmp_path: Path, k1: float) -> N
     x, _, z = ((points - pose[:, 3]) @ pose[:, :3]).T
     column = plain.cx - plain.fl_x * x / z
     colored = np.abs(found - 0.5).max(axis=-1) > 0.02
-    hidden, kept = shown & (column < edge - 3), shown & (column > edge + 3)
+    hidden, kept = shown & (column < edge - 4), shown & (column > edge + 3)
     facing = ((points - CENTER) * (pose[:, 3] - points)).sum(axis=-1) > 0.5
     assert (hidden & facing).sum() > 100
     assert not colored[hidden].any()
     assert colored[kept & facing].mean() > 0.9
 
 
-def test_where_nothing_lies_the_picture_is_no_darker_than_the_mesh(tmp_path: Path) -> None:
-    """Viewers mix it in from afar: black there would be specks."""
+def off_in_copies(textured: TexturedMesh, which: np.ndarray, copy: int) -> np.ndarray:
+    """How far colours inside some faces are in a copy of the texture, of 1 / 2^copy of its size,
+    from what they are in the texture: [P], the mean of the channels."""
+    weights = np.random.default_rng(0).dirichlet(np.ones(3), size=(len(which), 4))
+    uv = np.einsum("fkc,fcd->fkd", weights, textured.uv[textured.faces[which]]).reshape(-1, 2)
+    texture = Texture(textured.uv, textured.texture)
+    full, small = (texture.colors(uv, np.full(len(uv), 2.0**k)) for k in (0, copy))
+    off: np.ndarray = np.abs(small - full).mean(axis=1)
+    return off
+
+
+def two_colored(resolution: int = 48) -> TriangleMesh:
+    """The ball, its vertices red above and dark blue below: what lies beside what tells."""
+    mesh = painted_ball.ball(resolution)
+    above = (mesh.vertices[:, 2] > CENTER[2])[:, None]
+    return dataclasses.replace(mesh, colors=np.where(above, [0.9, 0.2, 0.1], [0.1, 0.1, 0.4]))
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_small_copies_show_faces_without_a_photo_in_their_own_colours(
+    tmp_path: Path, refined: bool
+) -> None:
+    """Viewers take them as soon as the thing is small, or turns away."""
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round()[:1])
+    )
+    textured = texture_from_photos(two_colored(), photos, 1024, refined=refined)
+    away = photos.frame.world_from_scene(photos.eye(0)[None])[0] - CENTER
+    middle = textured.vertices[textured.faces].mean(axis=1) - CENTER
+    behind = np.flatnonzero((middle @ away < 0.0) & (np.abs(middle[:, 2]) > 0.1))
+    assert len(behind) > 1000
+    for copy, most in ((1, 0.001), (2, 0.004), (3, 0.03)):
+        assert off_in_copies(textured, behind, copy).mean() < most
+
+
+def test_what_lies_on_no_face_goes_on_with_what_lies_beside_it(tmp_path: Path) -> None:
     photos = painted_ball.photos_of(
         tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
     )
-    picture = texture_from_photos(painted_ball.ball(), photos, 1024).texture
-    assert (picture[-1, -1] == 128).all(), "the mean of the vertices, which are grey"
+    textured = texture_from_photos(painted_ball.ball(), photos, 1024)
+    assert textured.texture.min() > 20, "nothing of the photos' black ground, nor of no colour"
+    everything = np.arange(len(textured.faces))
+    assert off_in_copies(textured, everything, 1).mean() < 0.01
+    assert off_in_copies(textured, everything, 2).mean() < 0.03
+
+
+def test_a_picture_is_as_large_as_its_charts_need_and_not_more(tmp_path: Path) -> None:
+    photos = painted_ball.photos_of(
+        tmp_path, painted_ball.write_photos(tmp_path, painted_ball.all_round())
+    )
+    textured = texture_from_photos(painted_ball.ball(), photos, 4096)
+    height, width = textured.texture.shape[:2]
+    assert width in (height, 2 * height)
+    assert skin_told(textured)["texture_filled"] > 0.25
+    assert skin_told(textured)["texture_size_px"] == [width, height]
 
 
 def test_a_picture_too_small_is_filled_with_less_detail(tmp_path: Path) -> None:
@@ -222,5 +272,5 @@ def test_what_is_done_moves_on_to_the_end(tmp_path: Path) -> None:
     assert told == sorted(told)
     assert told[-1] == 1.0
     last = [one for one in told if one > bake._LEVEL_SHARE]
-    assert len(last) >= len(made.texture) // texels.ROWS + 4 * bake._SPREAD_PX
+    assert len(last) >= len(made.texture) // texels.ROWS + 4 * MARGIN_PX
     assert len(set(last)) == len(last), "it says something new each time"

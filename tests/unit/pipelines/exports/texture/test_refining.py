@@ -44,12 +44,12 @@ def turned(pose: Floats, by: Floats) -> Floats:
 
 def test_a_pixel_mixes_texels_of_the_copy_it_asks_as_a_viewer_does() -> None:
     random = np.random.default_rng(0)
-    texture = random.random((32, 32, 3)).astype(np.float32)
-    places = random.uniform(0.0, 32.0, (300, 2))
+    texture = random.random((32, 64, 3)).astype(np.float32)
+    places = random.uniform(0.0, 1.0, (300, 2)) * (64.0, 32.0)
     level = random.integers(0, 3, 300)
-    found = mixing(places, level, 32) @ copies_of(texture)
+    found = mixing(places, level, (32, 64)) @ copies_of(texture)
     for k, side in enumerate((32, 16, 8)):
-        copy = texture.reshape(side, 32 // side, side, 32 // side, 3).mean(axis=(1, 3))
+        copy = texture.reshape(side, 32 // side, 2 * side, 32 // side, 3).mean(axis=(1, 3))
         mine = level == k
         wanted = between_pixels(copy, *(places[mine] / 2**k).T)
         assert np.allclose(found[mine], wanted, atol=1e-5)
@@ -58,10 +58,10 @@ def test_a_pixel_mixes_texels_of_the_copy_it_asks_as_a_viewer_does() -> None:
 def test_what_a_copy_misses_goes_to_the_texels_that_made_it() -> None:
     """Gathering is the adjoint of copying: <copies(t), y> = <t, gathered(y)>."""
     random = np.random.default_rng(1)
-    texture = random.random((16, 16, 3)).astype(np.float32)
+    texture = random.random((16, 32, 3)).astype(np.float32)
     copies = copies_of(texture)
     sums = random.random((len(copies), 4)).astype(np.float32)
-    gathered = refining._gathered(sums, 16)
+    gathered = refining._gathered(sums, (16, 32))
     assert np.vdot(copies, sums[:, :3]) == pytest.approx(np.vdot(texture, gathered[..., :3]), 1e-5)
 
 
@@ -69,7 +69,7 @@ def test_pixels_that_agree_are_met_and_one_that_is_far_off_hardly_counts() -> No
     random = np.random.default_rng(2)
     truth = random.uniform(0.3, 0.7, (16, 16, 3)).astype(np.float32)
     places = random.uniform(0.0, 16.0, (6000, 2))
-    seen = mixing(places, np.zeros(6000, np.int64), 16)
+    seen = mixing(places, np.zeros(6000, np.int64), (16, 16))
     color = np.rint(255.0 * (seen @ copies_of(truth))).astype(np.uint8)
     begun = np.clip(truth + 0.04, 0.0, 1.0).astype(np.float32)
     step, known = solved(begun, [(seen[:3000], color[:3000]), (seen[3000:], color[3000:])])
@@ -83,7 +83,7 @@ def test_pixels_that_agree_are_met_and_one_that_is_far_off_hardly_counts() -> No
 
 def test_a_texel_that_no_pixel_sees_stays() -> None:
     places = np.full((50, 2), 4.0)
-    seen = mixing(places, np.zeros(50, np.int64), 16)
+    seen = mixing(places, np.zeros(50, np.int64), (16, 16))
     step, known = solved(
         np.full((16, 16, 3), 0.5, np.float32), [(seen, np.zeros((50, 3), np.uint8))]
     )

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from pipelines.errors import Cancelled
-from pipelines.exports.texture.charts import TextureFull
+from pipelines.exports.texture.packing import TextureFull
 from pipelines.exports.texture.texels import texels_of
 from pipelines.exports.texture.unwrap import GUTTER_PX, Atlas, unwrap
 from tests.unit.pipelines.exports.texture import painted_ball
@@ -59,8 +59,8 @@ def flat_area(atlas: Atlas) -> np.ndarray:
 
 def chart_picture(atlas: Atlas) -> np.ndarray:
     """The chart of each texel, -1 where none is."""
-    picture = np.full((atlas.side, atlas.side), -1)
-    for texels in texels_of(atlas.uv, atlas.faces, atlas.side):
+    picture = np.full(atlas.size[::-1], -1)
+    for texels in texels_of(atlas.uv, atlas.faces, atlas.size):
         picture[texels.rows][texels.covered] = atlas.face_chart[texels.face]
     return picture
 
@@ -126,7 +126,7 @@ def test_charts_stay_apart_and_off_the_rim() -> None:
     atlas = of_density(*ball())
     assert atlas.num_charts > 5
     assert atlas.uv.min() >= GUTTER_PX
-    assert atlas.uv.max() <= atlas.side - GUTTER_PX
+    assert (atlas.uv <= np.array(atlas.size) - GUTTER_PX).all()
     picture = chart_picture(atlas)
     window = 2 * GUTTER_PX - 1
     highest = maximum_filter(picture, window)
@@ -138,11 +138,12 @@ def test_charts_stay_apart_and_off_the_rim() -> None:
 def test_a_picture_too_small_has_all_faces_smaller_and_says_so() -> None:
     vertices, faces = ball()
     large, small = of_density(vertices, faces), of_density(vertices, faces, 256)
-    assert large.side > small.side == 256
+    assert small.size == (256, 256)
+    assert max(large.size) > 256
     assert small.scale < 1.0
     ratio = np.abs(flat_area(small)).sum() / np.abs(flat_area(large)).sum()
     assert ratio == pytest.approx(small.scale**2, rel=0.01)
-    assert small.uv.max() <= small.side - GUTTER_PX
+    assert small.uv.max() <= 256 - GUTTER_PX
 
 
 def test_more_pieces_than_the_picture_has_room_for_are_refused() -> None:
