@@ -38,6 +38,7 @@ from api.client.client import (
     ApiProblem,
     Client,
     ConnectionFailed,
+    FilesInTheWay,
     Job,
     JobFailed,
     NerfworksError,
@@ -90,35 +91,43 @@ def _job_of(client: Client, args: argparse.Namespace) -> str:
     raise NerfworksError("There is no job yet.", "Start one: nerfworks submit FILE")
 
 
-def _download(client: Client, job_id: str, folder: Path, console: Console) -> list[Path]:
+def _download(
+    client: Client, job_id: str, folder: Path, args: argparse.Namespace, console: Console
+) -> list[Path]:
     with transfer_bar(console, "download") as report:
-        return client.download(job_id, folder, progress=report)
+        try:
+            return client.download(job_id, folder, progress=report, overwrite=args.overwrite)
+        except FilesInTheWay as error:
+            raise FilesInTheWay(
+                str(error), f"nerfworks download {job_id} OTHER_FOLDER, or --overwrite these."
+            ) from error
 
 
-def _finish(client: Client, job: Job, folder: Path | None, console: Console) -> int:
+def _finish(client: Client, job: Job, args: argparse.Namespace, console: Console) -> int:
     """After watching: download and show, or say why not."""
     if job.state != "succeeded":
         if job.error is None:
             console.print(f"The job is {job.state}.")
         print_error(job, console)
         return FAILED
-    if folder is None:
+    if args.download is None:
         console.print(f"Job {job.id} succeeded. Get its files: nerfworks download {job.id}")
         return OK
-    _download(client, job.id, folder, console)
+    folder = Path(args.download)
+    _download(client, job.id, folder, args, console)
     report = folder / "report.json"
     loaded = json.loads(report.read_text("utf-8")) if report.is_file() else {}
     print_results(job, folder, loaded, console)
     return OK
 
 
-def _watch(client: Client, job_id: str, folder: Path | None, console: Console) -> int:
+def _watch(client: Client, job_id: str, args: argparse.Namespace, console: Console) -> int:
     try:
         job = watch_job(client, job_id, console)
     except KeyboardInterrupt:
         console.print(f"\nThe job goes on. See it again: nerfworks watch {job_id}")
         return INTERRUPTED
-    return _finish(client, job, folder, console)
+    return _finish(client, job, args, console)
 
 
 def _print_json(found: BaseModel | list[BaseModel]) -> None:
@@ -158,8 +167,7 @@ def submit(client: Client, args: argparse.Namespace, console: Console) -> int:
     )
     ended = OK
     if args.wait or args.download is not None:
-        folder = None if args.download is None else Path(args.download)
-        ended = _watch(client, job.id, folder, console)
+        ended = _watch(client, job.id, args, console)
     else:
         console.print(f"See it: nerfworks watch {job.id}", highlight=False)
     if args.json:
@@ -185,7 +193,7 @@ def check(client: Client, args: argparse.Namespace, console: Console) -> int:
         return FAILED
     print_check(job.check, console)
     if args.download is not None and job.artifacts:
-        for path in _download(client, job.id, Path(args.download), console):
+        for path in _download(client, job.id, Path(args.download), args, console):
             console.print(clean(str(path)), highlight=False, soft_wrap=True)
     elif job.artifacts:
         console.print(f"With pictures: nerfworks download {job.id}", highlight=False)
@@ -204,7 +212,7 @@ def status(client: Client, args: argparse.Namespace, console: Console) -> int:
 
 def watch(client: Client, args: argparse.Namespace, console: Console) -> int:
     """Show a job until it is over."""
-    return _watch(client, _job_of(client, args), None, console)
+    return _watch(client, _job_of(client, args), args, console)
 
 
 def logs(client: Client, args: argparse.Namespace, console: Console) -> int:
@@ -237,7 +245,7 @@ def download(client: Client, args: argparse.Namespace, console: Console) -> int:
         do = f"nerfworks {'retry' if job.is_over else 'watch'} {job_id}"
         do = f"Run it again: {do}" if job.is_over else f"See it: {do}"
         raise NerfworksError(f"Job {job_id} is {job.state}: there is nothing to download.", do)
-    for path in _download(client, job_id, folder, console):
+    for path in _download(client, job_id, folder, args, console):
         console.print(clean(str(path)), highlight=False, soft_wrap=True)
     return OK
 
@@ -254,8 +262,7 @@ def retry(client: Client, args: argparse.Namespace, console: Console) -> int:
     again = [stage.name for stage in job.stages if stage.state in ("ready", "blocked")]
     console.print(f"Job {job.id} runs again: {', '.join(again)}", highlight=False)
     if args.wait or args.download is not None:
-        folder = None if args.download is None else Path(args.download)
-        return _watch(client, job.id, folder, console)
+        return _watch(client, job.id, args, console)
     console.print(f"See it: nerfworks watch {job.id}", highlight=False)
     return OK
 
@@ -269,8 +276,7 @@ def export(client: Client, args: argparse.Namespace, console: Console) -> int:
     console.print(f"Export {made.id}: {args.kind} of job {args.job}", highlight=False)
     ended = OK
     if args.wait or args.download is not None:
-        folder = None if args.download is None else Path(args.download)
-        ended = _watch(client, made.id, folder, console)
+        ended = _watch(client, made.id, args, console)
     else:
         console.print(f"See it: nerfworks watch {made.id}", highlight=False)
     if args.json:
@@ -357,9 +363,12 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     parser.add_argument("--url", help="the service; else NERFWORKS_URL, else this folder's")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
+    def overwrites(one: argparse.ArgumentParser) -> None:
+        one.add_argument("--overwrite", action="store_true", help="other files in DIR, too")
+
     def command(name: str, run: Callable[..., int], job: str = "") -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=(run.__doc__ or "").strip().rstrip("."))
-        added.set_defaults(run=run)
+        added.set_defaults(run=run, download=None, overwrite=False)
         if job == "newest":
             added.add_argument("job", nargs="?", metavar="JOB", help="left out: the newest")
         elif job == "named":
@@ -378,6 +387,7 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
     one.add_argument("--wait", action="store_true", help="show the job until it is over")
     one.add_argument("--download", metavar="DIR", help="wait, then download the results there")
+    overwrites(one)
     as_json = [one, command("status", status, "newest")]
     one = command("check", check)
     one.add_argument(
@@ -387,25 +397,30 @@ def _parser(with_up: bool) -> argparse.ArgumentParser:
     one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
     one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
     one.add_argument("--download", metavar="DIR", help="download the reports there")
+    overwrites(one)
     as_json.append(one)
     command("watch", watch, "newest")
     one = command("logs", logs, "newest")
     one.add_argument("--stage", help="only this stage")
     one.add_argument("--line", type=int, default=0, help="from this line on; negative: the tail")
     one.add_argument("--follow", action="store_true", help="go on until the job is over")
-    command("download", download, "newest").add_argument("folder", nargs="?", metavar="DIR")
+    one = command("download", download, "newest")
+    one.add_argument("folder", nargs="?", metavar="DIR", help="left out: out/JOB")
+    overwrites(one)
     command("cancel", cancel, "named")
     one = command("retry", retry, "named")
     one.add_argument("--from", dest="from_stage", metavar="STAGE", help="begin with this stage")
     one.add_argument("--set", action="append", default=[], metavar="STAGE.OPTION=VALUE")
     one.add_argument("--wait", action="store_true", help="show the job until it is over")
     one.add_argument("--download", metavar="DIR", help="wait, then download the results there")
+    overwrites(one)
     one = command("export", export, "named")
     one.add_argument("kind", metavar="KIND", help="`nerfworks exports --kinds` lists them")
     one.add_argument("--set", action="append", default=[], metavar="OPTION=VALUE")
     one.add_argument("--label", action="append", default=[], metavar="KEY=VALUE")
     one.add_argument("--wait", action="store_true", help="show the export until it is over")
     one.add_argument("--download", metavar="DIR", help="wait, then download the files there")
+    overwrites(one)
     as_json.append(one)
     one = command("exports", exports, "newest")
     one.add_argument("--kinds", action="store_true", help="what can be exported")

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -30,6 +31,7 @@ from api.client.models import (
     Event,
     Export,
     ExportKind,
+    FilesInTheWay,
     Job,
     JobError,
     JobFailed,
@@ -41,7 +43,7 @@ from api.client.models import (
     Stage,
     WaitTimedOut,
 )
-from api.client.transfer import Download, MultipartFile, OnProgress
+from api.client.transfer import Download, MultipartFile, OnProgress, refuse_to_overwrite
 from api.client.wire import (
     BUSY,
     Patience,
@@ -68,6 +70,7 @@ __all__ = [
     "Event",
     "Export",
     "ExportKind",
+    "FilesInTheWay",
     "Job",
     "JobError",
     "JobFailed",
@@ -372,12 +375,16 @@ class Client:
         folder: str | Path,
         names: Iterable[str] | None = None,
         progress: Callable[[str, int, int], None] | None = None,
+        *,
+        overwrite: bool = False,
     ) -> list[Path]:
         """Download artifacts, all or those of these names, into a folder.
 
         Goes on where an earlier download broke off; what is there already is not fetched again;
         each file is verified and appears whole. progress: called with (name, bytes, of bytes).
-        Raises ChecksumMismatch, ApiProblem, ConnectionFailed; NerfworksError for an unknown name.
+        overwrite: replace files of these names that are others, as another job's are; else nothing
+        is downloaded where there is one. Raises FilesInTheWay, ChecksumMismatch, ApiProblem,
+        ConnectionFailed; NerfworksError for an unknown name.
         """
         folder = Path(folder)
         offered = {artifact.name: artifact for artifact in self.artifacts(job_id)}
@@ -388,23 +395,20 @@ class Client:
                     f"Job {job_id} has no artifact {name}.", f"It has {', '.join(offered)}."
                 )
         folder.mkdir(parents=True, exist_ok=True)
-        return [self._download(job_id, offered[name], folder, progress) for name in wanted]
+        tell = progress or (lambda name, done, size: None)
+        downloads = [Download(offered[name], folder, partial(tell, name)) for name in wanted]
+        missing = [download for download in downloads if not download.is_done()]
+        if not overwrite:
+            refuse_to_overwrite(missing)
+        for download in downloads:
+            if download in missing:
+                self._download(job_id, download)
+            else:
+                tell(download.artifact.name, download.artifact.bytes, download.artifact.bytes)
+        return [download.target for download in downloads]
 
-    def _download(
-        self,
-        job_id: str,
-        artifact: Artifact,
-        folder: Path,
-        progress: Callable[[str, int, int], None] | None,
-    ) -> Path:
-        def report(done: int, size: int) -> None:
-            if progress is not None:
-                progress(artifact.name, done, size)
-
-        download = Download(artifact, folder, report)
-        if download.is_done():
-            report(artifact.bytes, artifact.bytes)
-            return download.target
+    def _download(self, job_id: str, download: Download) -> None:
+        artifact = download.artifact
         url = f"/v1/jobs/{segment(job_id)}/artifacts/{segment(artifact.name)}"
         patience = Patience(self._wire.retry_s)
         damaged = 0
@@ -412,7 +416,7 @@ class Client:
             before = download.bytes_here
             try:
                 download.attempt(self._wire.http, url)
-                return download.target
+                return
             except ChecksumMismatch:
                 damaged += 1
                 if damaged > 1 or not before:

@@ -5,6 +5,7 @@ NerfworksError
   ApiProblem            the service answered with an error: status, code, message, hint
   JobFailed             a job that was waited for did not succeed
   WaitTimedOut          a job is not over after the time that was given
+  FilesInTheWay         a download would take the place of other files
   ChecksumMismatch      downloaded bytes are not those that the service promised
 """
 
@@ -240,6 +241,10 @@ class WaitTimedOut(NerfworksError):
         super().__init__(
             f"Job {job.id} is {job.state}{at} after {timeout_s:.0f} s.", "It goes on; wait again."
         )
+
+
+class FilesInTheWay(NerfworksError):
+    """A download would take the place of files that are another job's, or nobody knows whose."""
 
 
 class ChecksumMismatch(NerfworksError):

@@ -5,15 +5,16 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 import httpx
 
-from api.client.models import Artifact, ChecksumMismatch, NerfworksError
+from api.client.models import Artifact, ChecksumMismatch, FilesInTheWay, NerfworksError
 
 CHUNK_BYTES = 1 << 18
+_MOST_NAMED = 5
 OnProgress = Callable[[int, int], None]
 """Called with (bytes so far, bytes in all)."""
 
@@ -64,6 +65,24 @@ def sha256_of(path: Path) -> str:
     """The digest of a file, in hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def refuse_to_overwrite(downloads: Sequence[Download]) -> None:
+    """Raise FilesInTheWay where a download would take the place of another file.
+
+    The files of all jobs and exports have the same names: two of them in one folder would be mixed.
+    """
+    taken = [download for download in downloads if download.target.exists()]
+    if not taken:
+        return
+    names = ", ".join(download.artifact.name for download in taken[:_MOST_NAMED])
+    more = f" and {len(taken) - _MOST_NAMED} more" if len(taken) > _MOST_NAMED else ""
+    raise FilesInTheWay(
+        f"{taken[0].target.parent} has other files of these names already: {names}{more}. Nothing "
+        "was downloaded.",
+        "They are another job's or export's, or what this one had before: name another folder, or "
+        "have them overwritten (overwrite=True, --overwrite).",
+    )
 
 
 class Download:

@@ -130,7 +130,7 @@ def test_an_export_is_asked_for_waited_for_and_downloaded(
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     out = tmp_path / "out"
-    wanted = ["--set", "mesh.triangles=5", "--set", 'formats=["glb","usdz"]', "--label", "a=b"]
+    wanted = ["--set", "mesh.triangles=500", "--set", 'formats=["glb","usdz"]', "--label", "a=b"]
     assert cli.main(["export", job, "mesh", *wanted, "--download", str(out)]) == 0
     thread.join()
     assert [path.name for path in out.iterdir()] == ["mesh.usdz"]
@@ -141,7 +141,7 @@ def test_an_export_is_asked_for_waited_for_and_downloaded(
         (made,) = client.exports(job)
         assert made.export is not None
         assert (made.export.kind, made.export.job_id) == ("mesh", job)
-        assert made.options["mesh"]["triangles"] == 5
+        assert made.options["mesh"]["triangles"] == 500
         assert made.options["mesh"]["formats"] == ["glb", "usdz"]
         assert made.labels == {"a": "b"}
     assert cli.main(["exports", job]) == 0
@@ -283,6 +283,24 @@ def test_download_goes_to_a_folder_of_the_job(
     finish_job(command.services, job, lambda name: b"x")
     assert cli.main(["download"]) == 0
     assert (tmp_path / "out" / job / "video.mp4").read_bytes() == b"x"
+
+
+def test_download_over_other_files_is_refused_unless_it_is_said(
+    command: LiveServer, archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["submit", str(archive), "--preset", "preview"]) == 0
+    job = newest(command)
+    finish_job(command.services, job, lambda name: b"new")
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mesh.glb").write_bytes(b"of another job")
+    assert cli.main(["download", job, str(out)]) == 1
+    said = capsys.readouterr().err
+    assert "mesh.glb" in said
+    assert f"nerfworks download {job} OTHER_FOLDER" in said
+    assert (out / "mesh.glb").read_bytes() == b"of another job"
+    assert cli.main(["download", job, str(out), "--overwrite"]) == 0
+    assert (out / "mesh.glb").read_bytes() == b"new"
 
 
 def test_download_of_a_job_that_offers_nothing_says_how_it_stands(

@@ -22,6 +22,7 @@ from api.client.client import (
     ChecksumMismatch,
     Client,
     ConnectionFailed,
+    FilesInTheWay,
     Job,
     JobFailed,
     NerfworksError,
@@ -229,8 +230,25 @@ def test_download_is_verified_whole_and_not_repeated(
     client.download(finished, out)
     assert {path: path.stat().st_mtime_ns for path in paths} == before
     paths[0].write_bytes(b"spoiled")
-    client.download(finished, out, names=[paths[0].name])
+    client.download(finished, out, names=[paths[0].name], overwrite=True)
     assert paths[0].read_bytes() == CONTENT
+
+
+def test_files_of_two_jobs_are_not_mixed_in_one_folder(
+    client: Client, live: LiveServer, finished: str, archive: Path, tmp_path: Path
+) -> None:
+    other = client.create_job(client.upload(archive).id).id
+    finish_job(live.services, other, lambda name: b"other " + name.encode())
+    out = tmp_path / "out"
+    first = client.download(finished, out, names=["mesh.glb"])
+    with pytest.raises(FilesInTheWay, match=r"mesh\.glb") as caught:
+        client.download(other, out)
+    assert "another folder" in caught.value.hint
+    assert [path.name for path in out.iterdir()] == ["mesh.glb"], "nothing was downloaded"
+    assert first[0].read_bytes() == CONTENT
+    client.download(other, out, names=["preview.jpg"])
+    assert len(client.download(other, out, overwrite=True)) == NUM_ARTIFACTS
+    assert first[0].read_bytes() == b"other mesh.glb"
 
 
 def test_download_of_an_unknown_name_says_what_there_is(
