@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from pipelines.captures.archive_rules import shown
-from pipelines.captures.magic import foreign_image, image_format, video_container
+from pipelines.captures.magic import foreign_image, image_format, is_zip, video_container
 from pipelines.captures.unpack import CaptureArchive
 
 _MOST_GROUPS = 6
@@ -29,7 +29,9 @@ _BY_SUFFIX = {
     "conf": "confidence file",
     "npy": "array file",
     "npz": "array file",
-} | dict.fromkeys(("ply", "obj", "glb", "gltf", "usd", "usdz", "fbx", "stl", "las"), "3D model")
+    **dict.fromkeys(("ply", "obj", "glb", "gltf", "usd", "usdz", "fbx", "stl", "las"), "3D model"),
+    **dict.fromkeys(("docx", "xlsx", "pptx", "odt", "ods", "pages", "numbers", "pdf"), "document"),
+}
 
 _POSES_BY_NAME = (
     (r"(^|/)(cameras|images|points3D|frames|rigs)\.(bin|txt)$", "COLMAP"),
@@ -123,6 +125,8 @@ def _known(name: str, head: bytes) -> tuple[str, str]:
     program = _program(name, suffix, head)
     if program:
         return "file", f"camera poses of {program} are not read"
+    if is_zip(head) and suffix not in _BY_SUFFIX:
+        return "archive", "archives within an archive are not opened; pack what is in them instead"
     return _BY_SUFFIX.get(suffix, "file"), ""
 
 

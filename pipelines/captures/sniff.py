@@ -27,6 +27,7 @@ from pipelines.captures.magic import (
     HEAD_BYTES,
     foreign_image,
     image_format,
+    is_zip,
     video_container,
 )
 from pipelines.errors import CaptureError
@@ -131,6 +132,8 @@ def _no_images(heads: Mapping[str, bytes]) -> CaptureError:
     hint = "Put the photos (JPEG, HEIC, camera raw, PNG, WebP, AVIF, TIFF) into the .zip."
     if foreign:
         hint = f"{', '.join(foreign)} pictures are not supported yet: convert them to JPEG."
+    elif any(is_zip(head) for head in heads.values()):
+        hint = "It holds other archives, which are not opened: pack what is in them instead."
     return CaptureError(
         f"The archive has {len(heads)} files, and none is a picture that can be read.",
         code="no_images",

@@ -9,6 +9,7 @@ import pytest
 
 from pipelines.captures.archive_rules import ArchiveLimits
 from pipelines.captures.leftovers import leftover_warnings, leftovers
+from pipelines.captures.sniff import sniff
 from pipelines.captures.unpack import CaptureArchive
 from tests.unit.pipelines.captures.archives import nerfstudio_files, picture, write_zip
 from tests.unit.pipelines.captures.ingesting import Files, ingest, warning_with
@@ -36,6 +37,20 @@ def test_nothing_is_said_where_nothing_is_left(tmp_path: Path) -> None:
     assert told(tmp_path, {"a.txt": "x"}, used=("a.txt",)) == []
     summary, _ = ingest(tmp_path, nerfstudio_files())
     assert (summary["warnings"], "leftovers" in summary) == ([], False)
+
+
+def test_files_that_are_zips_inside_leave_the_photos_a_capture(tmp_path: Path) -> None:
+    """What scanning apps, NumPy and Word write lay beside photos, and the whole was refused."""
+    inner = write_zip(tmp_path / "inner.zip", {"scene.usdc": b"x" * 100}).read_bytes()
+    files: Files = {f"IMG_{n}.jpg": picture(seed=n) for n in range(8)}
+    files |= dict.fromkeys(("scan.usdz", "poses.npz", "notes.docx", "more.zip", "more.cbz"), inner)
+    assert sniff(write_zip(tmp_path / "c.zip", files), "c.zip").kind == "images"
+    summary, _ = ingest(tmp_path, files)
+    assert summary["num_images"] == 8
+    told = "\n".join(summary["warnings"])
+    for text in ("3D model (scan.usdz)", "array file (poses.npz)", "document (notes.docx)"):
+        assert f"1 {text}" in told
+    assert "2 archives at the top were not used: archives within an archive are not opened" in told
 
 
 def test_looking_at_a_file_does_not_use_it(tmp_path: Path) -> None:

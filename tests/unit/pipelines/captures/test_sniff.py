@@ -293,12 +293,16 @@ def test_entries_that_share_bytes_are_refused(tmp_path: Path) -> None:
     assert code_of(path) == "archive_bomb"
 
 
-def test_archive_in_an_archive_is_refused(tmp_path: Path) -> None:
+def test_an_archive_in_an_archive_is_no_picture_and_is_not_opened(tmp_path: Path) -> None:
     inner = io.BytesIO()
     with zipfile.ZipFile(inner, "w") as archive:
         archive.writestr("b.jpg", picture())
     path = write_zip(tmp_path / "c", {"a.jpg": picture(), "innocent.jpg": inner.getvalue()})
-    assert code_of(path) == "archive_unsafe"
+    assert sniff(path, "c.zip").details["num_images"] == 1
+    path = write_zip(tmp_path / "d", {"photos.zip": inner.getvalue()})
+    with pytest.raises(CaptureError, match="none is a picture") as caught:
+        sniff(path, "d.zip")
+    assert "other archives, which are not opened" in caught.value.hint
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
