@@ -2,7 +2,8 @@
 
 Five things tell, in this order:
 
-1. takes: a photo that lies there as camera raw and developed, or as HEIC and JPEG, is taken once.
+1. takes: a photo that lies there as camera raw and developed, or as HEIC and JPEG, is taken once,
+   where both were taken at one time, or show the same: another phone may have used the name.
 2. channels: beside colour photos, a lossless picture of one channel is a mask, a depth or a
    confidence map. Where no picture has colour, grey ones are photos unless their name says what
    else they are.
@@ -10,8 +11,8 @@ Five things tell, in this order:
    smaller than photos are decoded for it.
 4. names: folders and files called mask, depth, conf, thumbnail and the like (`roles`), which speak
    only where photos remain beside them.
-5. copies: the same picture again, in the same size or reduced (`images_2/`, `images_4/`); decided
-   by comparing what they show, not by the folder.
+5. copies: the same picture again, in the same size or reduced (`images_2/`, `images_4/`), edited,
+   or as a messenger sent it; decided by comparing what they show, not by folder or name.
 
 What cannot be decoded stays, for whoever writes the pictures to report.
 """
@@ -26,11 +27,19 @@ from dataclasses import dataclass
 import numpy as np
 import PIL.Image
 import PIL.ImageOps
+from numpy.typing import NDArray
 
 from pipelines.captures.decoders import DAMAGED, open_picture
 from pipelines.captures.exif import read_exif
+from pipelines.captures.photo_copies import LOOK_PX, Candidate, copies_among
 from pipelines.captures.raw_photos import FORMAT as RAW
-from pipelines.captures.roles import file_role, folder_role, named_role, plain_stem
+from pipelines.captures.roles import (
+    file_role,
+    folder_role,
+    named_role,
+    original_stem,
+    plain_stem,
+)
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 from pipelines.stage import StageContext
@@ -74,13 +83,15 @@ brighter and have other contrast."""
 
 @dataclass(frozen=True)
 class _Look:
-    """What a picture's header says. width, height: of the picture turned upright."""
+    """What a picture's header says. width, height: of the picture turned upright. taken_at: as in
+    `Exif`."""
 
     name: str
     kind: str
     mode: str
     width: int
     height: int
+    taken_at: str | None = None
 
     @property
     def num_pixels(self) -> int:
@@ -114,7 +125,7 @@ def choose_photos(
             looks.append(look)
         ctx.progress(0.0, f"Looking at picture {done} of {len(names)}")
     images = _Images(archive, max_pixels)
-    looks = _once_each(archive, looks)
+    looks = _once_each(archive, looks, images)
     looks = _by_channels(archive, looks)
     looks = _by_values(archive, looks, images)
     looks = _by_names(archive, looks)
@@ -140,9 +151,10 @@ def _look(archive: CaptureArchive, name: str) -> _Look | None:
         with open_picture(header_of(archive, name), kind) as image:
             found = RAW if image.format == RAW else kind
             sides = image.size
-            if (read_exif(image).orientation or 1) >= _FIRST_ON_ITS_SIDE:
+            exif = read_exif(image)
+            if (exif.orientation or 1) >= _FIRST_ON_ITS_SIDE:
                 sides = sides[1], sides[0]
-            return _Look(name, found, image.mode, *sides)
+            return _Look(name, found, image.mode, *sides, exif.taken_at)
     except DAMAGED:
         return None
 
@@ -169,8 +181,30 @@ class _Images:
         except DAMAGED:
             return None
 
+    def brightness(self, look: _Look, side_px: int) -> NDArray[np.float32] | None:
+        """The upright picture's brightness as a square, or None as `decoded`."""
+        if look.num_pixels > self._max_pixels:
+            return None
+        try:
+            data = io.BytesIO(self._archive.peek(look.name, _MOST_BYTES))
+            with open_picture(data, look.kind) as image:
+                width, height = image.size
+                image.draft("RGB", (2 * side_px, 2 * side_px))
+                # A JPEG that was decoded smaller is padded: sides are rounded up.
+                scale = max(1, round(width / image.width))
+                plain = image.convert("RGB" if image.mode == "P" else "L").convert("L")
+                square = plain.resize(
+                    (side_px, side_px),
+                    PIL.Image.Resampling.LANCZOS,
+                    box=(0, 0, min(width / scale, image.width), min(height / scale, image.height)),
+                )
+                square.info["exif"] = image.getexif().tobytes()
+                return np.asarray(PIL.ImageOps.exif_transpose(square), np.float32)
+        except DAMAGED:
+            return None
 
-def _once_each(archive: CaptureArchive, looks: Sequence[_Look]) -> list[_Look]:
+
+def _once_each(archive: CaptureArchive, looks: Sequence[_Look], images: _Images) -> list[_Look]:
     """The pictures without those that are the same take as another one of that name and folder.
 
     Phones and cameras write a raw and the photo that they developed from it, and apps an HEIC and
@@ -185,11 +219,30 @@ def _once_each(archive: CaptureArchive, looks: Sequence[_Look]) -> list[_Look]:
     for take in takes.values():
         best = min(take, key=lambda look: (look.kind == RAW, -look.num_pixels, look.kind == "JPEG"))
         for look in take:
-            if look.kind != best.kind:
+            if look.kind != best.kind and _is_one_take(look, best, images):
                 (raw if look.kind == RAW else others).append(look.name)
     archive.set_aside(raw, "the same photo lies there developed")
     archive.set_aside(others, "the same photo lies there in another format")
     return _without(looks, [*raw, *others])
+
+
+def _is_one_take(look: _Look, best: _Look, images: _Images) -> bool:
+    """Whether two pictures of one name are one photo: two phones give the same names.
+
+    What cannot be decoded is taken for the same: nothing is lost with it.
+    """
+    if look.taken_at is not None and look.taken_at == best.taken_at:
+        return True
+    seen = [images.brightness(item, _COMPARED_PX) for item in (look, best)]
+    if seen[0] is None or seen[1] is None:
+        return True
+    return _correlation(seen[0], seen[1]) >= _SAME_TAKE
+
+
+def _correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
+    first, second = first - first.mean(), second - second.mean()
+    spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
+    return float((first * second).sum()) / spread if spread > 0 else 0.0
 
 
 def _by_channels(archive: CaptureArchive, looks: Sequence[_Look]) -> list[_Look]:
@@ -282,7 +335,30 @@ def _without_copies(
         ctx.check_cancelled()
         reduced += _copies(group, images)
     archive.set_aside(reduced, "a copy of a larger or equal picture")
-    return _without(looks, reduced)
+    looks = _without(looks, reduced)
+    named_otherwise = _copies_under_any_name(looks, images, ctx)
+    archive.set_aside(named_otherwise, "an edited, sent or reduced copy of another photo")
+    return _without(looks, named_otherwise)
+
+
+def _copies_under_any_name(looks: Sequence[_Look], images: _Images, ctx: StageContext) -> list[str]:
+    """Names of the copies. The largest is kept, of several as large one that says when it was
+    taken, then the one of most bytes; raw last."""
+    order = sorted(
+        looks,
+        key=lambda look: (look.kind == RAW, -look.num_pixels, look.taken_at is None, look.name),
+    )
+
+    def look_at(number: int) -> NDArray[np.float32] | None:
+        ctx.check_cancelled()
+        ctx.progress(0.0, f"Looking for copies, {number + 1} of {len(order)}")
+        return images.brightness(order[number], LOOK_PX)
+
+    photos = [
+        Candidate(look.width / look.height, look.taken_at, original_stem(look.name))
+        for look in order
+    ]
+    return [order[number].name for number in copies_among(photos, look_at)]
 
 
 def _groups(looks: Iterable[_Look], key: Callable[[_Look], object]) -> list[list[_Look]]:
@@ -328,9 +404,7 @@ def _shows_same(
     if abs(aspect - 1) > _ASPECT_SLACK:
         return False
     if (look.kind == RAW) != (other.kind == RAW):
-        first, second = (values - values.mean() for values in reduced)
-        spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
-        return spread > 0 and float((first * second).sum()) >= _SAME_TAKE * spread
+        return _correlation(reduced[0], reduced[1]) >= _SAME_TAKE
     return float(np.abs(reduced[0] - reduced[1]).mean()) <= _COPY_DIFFERENCE
 
 

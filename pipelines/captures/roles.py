@@ -14,6 +14,9 @@ PICTURE_SUFFIX = (
 )
 """How names of pictures end, as a pattern."""
 
+_OF_COPIES = frozenset({"edited", "edit", "copy", "of", "small", "large", "reduced", "resized"})
+"""Words that programs add to the name of a copy."""
+
 _WHATS = {
     "mask": "masks",
     "masks": "masks",
@@ -54,6 +57,12 @@ def plain_stem(name: str) -> str:
     """
     words = re.findall(r"[a-z]+|[0-9]+", _stem(name).lower())
     return "".join(word for word in words if word not in _WHATS)
+
+
+def original_stem(name: str) -> str:
+    """`plain_stem` without words that say that it is a copy: "img0001" of "IMG_0001-edited.jpg"."""
+    words = re.findall(r"[a-z]+|[0-9]+", _stem(name).lower())
+    return "".join(word for word in words if word not in _WHATS and word not in _OF_COPIES)
 
 
 def _stem(name: str) -> str:

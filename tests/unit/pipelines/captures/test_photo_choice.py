@@ -229,3 +229,96 @@ def test_a_damaged_picture_is_still_reported_as_that(tmp_path: Path) -> None:
     summary, ctx = ingest(tmp_path, files)
     assert len(sources(ctx)) == 11
     assert warning_with(summary, "Left out", "images/5.jpg")
+
+
+# --- copies under other names -----------------------------------------------------------------
+
+
+def fine_scene(
+    seed: int, shift: float = 0.0, size: tuple[int, int] = (480, 640)
+) -> PIL.Image.Image:
+    """A photo with details, filmed from a camera that has moved by so many pixels."""
+    rng = np.random.default_rng(seed)
+    moved = 0.75 * shift / size[1]
+    layers = [
+        PIL.Image.fromarray(rng.integers(0, 256, (n, n, 3), np.uint8)).resize(
+            size[::-1], 3, box=(moved * n, 0, (moved + 0.75) * n, n)
+        )
+        for n in (8, 24, 60)
+    ]
+    mean = np.mean([np.asarray(layer, np.float64) for layer in layers], axis=0)
+    return PIL.Image.fromarray(np.clip(mean, 0, 255).astype(np.uint8))
+
+
+def sent(image: PIL.Image.Image, long_side: int = 480, taken_at: str = "", **save: int) -> bytes:
+    """A photo as a messenger sends it: reduced, and packed harder."""
+    exif = PIL.Image.Exif()
+    if taken_at:
+        exif.get_ifd(0x8769)[0x9003] = taken_at
+    scale = long_side / max(image.size)
+    stream = io.BytesIO()
+    image.resize((round(image.width * scale), round(image.height * scale)), 1).save(
+        stream, "JPEG", exif=exif, **{"quality": 75, **save}
+    )
+    return stream.getvalue()
+
+
+def originals(count: int = 8, timed: bool = False) -> Files:
+    return {
+        f"IMG_{n:04d}.jpg": sent(
+            fine_scene(n), 640, f"2024:05:06 07:08:{n:02d}" if timed else "", quality=92
+        )
+        for n in range(count)
+    }
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_what_a_messenger_sent_is_no_second_photo(tmp_path: Path, timed: bool) -> None:
+    files = originals(timed=timed)
+    files |= {f"IMG-20240506-WA{n + 40:04d}.jpg": sent(fine_scene(n)) for n in range(8)}
+    kept = taken(tmp_path, files, "8 pictures", "copy of another photo")
+    assert kept == list(originals())
+
+
+def test_edited_photos_are_no_second_ones(tmp_path: Path) -> None:
+    files = originals()
+    for n in range(8):
+        brighter = fine_scene(n).point([min(round(1.2 * value), 255) for value in range(256)] * 3)
+        files[f"IMG_{n:04d}-edited.jpg"] = sent(brighter)
+    assert taken(tmp_path, files, "8 pictures", "edited") == list(originals())
+
+
+@pytest.mark.parametrize("moved_px", [0.5, 2.0, 20.0])
+def test_neighbours_of_a_slow_film_are_no_copies(tmp_path: Path, moved_px: float) -> None:
+    files: Files = {
+        f"f{n}.jpg": sent(fine_scene(1, n * moved_px), 640, quality=90) for n in range(8)
+    }
+    assert taken(tmp_path, files) == list(files)
+
+
+def test_photos_taken_at_other_times_are_no_copies(tmp_path: Path) -> None:
+    """A camera on a tripod takes the same picture; only who has no time is compared."""
+    files: Files = {
+        f"t{n}.jpg": sent(fine_scene(1), 640, f"2024:05:06 07:08:{n:02d}", quality=90 - n)
+        for n in range(8)
+    }
+    assert taken(tmp_path, files) == list(files)
+
+
+def test_two_phones_that_number_alike_keep_their_photos(tmp_path: Path) -> None:
+    files = originals()
+    for n in range(8):
+        stream = io.BytesIO()
+        fine_scene(50 + n, size=(360, 480)).save(stream, "AVIF", quality=80)
+        files[f"IMG_{n:04d}.avif"] = stream.getvalue()
+    assert sorted(taken(tmp_path, files)) == sorted(files)
+
+
+def test_a_photo_in_two_formats_is_one(tmp_path: Path) -> None:
+    files = originals()
+    for n in range(8):
+        stream = io.BytesIO()
+        fine_scene(n).resize((320, 240)).save(stream, "AVIF", quality=80)
+        files[f"IMG_{n:04d}.avif"] = stream.getvalue()
+    kept = taken(tmp_path, files, "8 pictures", "another format")
+    assert kept == list(originals())
