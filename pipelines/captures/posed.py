@@ -34,6 +34,8 @@ Matrix = npt.NDArray[np.float64]
 
 _SLACK = 0.05
 """How far a rotation may be from orthonormal before it is called malformed; files are rounded."""
+_COMMON = 0.75
+"""Share of the poses whose rotations have one scale for it to be divided out of all."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ def write_posed(
             f"of {len(sources)} pictures {len(picked)} are taken, at even distances",
         )
         sources, num_passed_over = [sources[index] for index in picked], len(left)
+    scale = common_scale(np.array([item.world_from_camera for item in sources], np.float64))
     depths = DepthWriter(archive, ctx.out, max_pixels=options.max_pixels)
     film = FilmFrames(archive, ctx.out, max_pixels=options.max_pixels)
     beside = _masks_beside(archive, sources, options, ctx)
@@ -84,7 +87,7 @@ def write_posed(
         stored, warnings = store_each(
             archive,
             sources,
-            partial(_store, depths, film, beside),
+            partial(_store, depths, film, beside, scale),
             options,
             ctx,
             upright=False,
@@ -139,6 +142,7 @@ def write_posed(
         },
         warnings=[
             *capture.warnings,
+            *_told_scale(scale),
             *film.warnings,
             *warnings,
             *move.warnings,
@@ -167,6 +171,7 @@ def _store(
     depths: DepthWriter,
     film: FilmFrames,
     beside: PhotoMasks,
+    scale: float,
     writer: PictureWriter,
     source: PosedSource,
     number: int,
@@ -176,7 +181,7 @@ def _store(
     Raises CaptureError for what makes the frame unusable.
     """
     what = f'"{shown(source.label)}"'
-    pose = checked_pose(np.array(source.world_from_camera, np.float64), what)
+    pose = checked_pose(np.array(source.world_from_camera, np.float64), what, scale)
     if source.frame is None:
         beside.check(source.name)
         picture = writer.store(source.name, number, beside.of.get(source.name), beside.meaning)
@@ -219,12 +224,45 @@ def _rows(pose: Matrix) -> Rows:
     return tuple(tuple(float(value) for value in row) for row in pose)
 
 
-def checked_pose(matrix: Matrix, what: str) -> Matrix:
+def common_scale(poses: Matrix) -> float:
+    """What the rotations of poses [N, 3, 4] are multiplied by, where it is one number for most of
+    them; 1.0 where it is none, or differs: `checked_pose` then says which are wrong.
+
+    Some programs leave the scale by which they moved a scene as a whole in the rotations; positions
+    are right with it. Raises CaptureError poses_malformed where all axes are left-handed.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        volumes = np.linalg.det(poses.reshape(-1, 3, 4)[:, :, :3])
+    volumes = volumes[np.isfinite(volumes) & (volumes != 0.0)]
+    if len(volumes) > 1 and (volumes < 0.0).all():
+        raise malformed(
+            "The poses have left-handed axes: their rotations mirror what they turn.",
+            "Export them with right-handed axes (nerfstudio's and Blender's: X right, Y up, seen "
+            "along -Z; COLMAP's: X right, Y down, seen along +Z; the world mirrored likewise), or "
+            "send the pictures alone to have their poses found.",
+        )
+    scales = np.cbrt(np.abs(volumes))
+    middle = float(np.median(scales)) if len(scales) else 1.0
+    is_common = np.mean(np.abs(scales / middle - 1.0) <= _SLACK / 2) >= _COMMON
+    return middle if is_common and abs(middle - 1.0) > _SLACK / 2 else 1.0
+
+
+def _told_scale(scale: float) -> list[str]:
+    if scale == 1.0:
+        return []
+    return [
+        f"The poses' rotations are {scale:.4g} times as large as rotations are; that was divided "
+        "out. Positions are as they came."
+    ]
+
+
+def checked_pose(matrix: Matrix, what: str, scale: float = 1.0) -> Matrix:
     """A pose whose rotation is made exactly orthonormal. [3, 4] to [3, 4].
 
-    Raises CaptureError poses_malformed for a mirrored, sheared, scaled or empty rotation.
+    scale: what its rotation is multiplied by (`common_scale`). Raises CaptureError poses_malformed
+    for a mirrored, sheared, otherwise scaled or empty rotation.
     """
-    rotation = matrix[:, :3]
+    rotation = matrix[:, :3] / scale
     with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers are refused below
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not np.isfinite(matrix).all() or not error <= _SLACK or np.linalg.det(rotation) < 0:

@@ -406,7 +406,10 @@ def _given(take: Take) -> list[Finding]:
 
 def _doubted(take: Take) -> list[Finding]:
     """Poses that were found, and that what pictures show contradicts, or that lack a side."""
-    return [_told(warning, "severe") for warning in take.doubts]
+    return [
+        _told(warning, "moderate" if warning["code"] == "lenses_unsettled" else "severe")
+        for warning in take.doubts
+    ]
 
 
 def _told(warning: Mapping[str, Any], severity: Severity) -> Finding:

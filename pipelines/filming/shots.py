@@ -73,7 +73,7 @@ class Clip:
     most_shared: int | None = None
 
 
-DOUBTS = ("path_torn", "poses_contradicted", "sides_alike")
+DOUBTS = ("path_torn", "poses_contradicted", "sides_alike", "lenses_unsettled")
 """Codes of warnings that a whole model of poses is doubted by, or that it has one side only."""
 
 

@@ -33,7 +33,8 @@ from pipelines.sfm.key_frames import (
     missing_keys,
     placing_pairs,
 )
-from pipelines.sfm.mending import Sides, mended
+from pipelines.sfm.lens_groups import Lenses, Settled, own_lenses, told_apart
+from pipelines.sfm.mending import Mapping, Sides, mended
 from pipelines.sfm.pairs import Pairs, choose_matcher, pairs_through_others, planned_pairs
 from pipelines.sfm.progress import ProgressScale, Span
 from pipelines.sfm.report import Attempt, Outcome, check_features
@@ -52,12 +53,13 @@ from pipelines.sfm.rungs import (
     Rung,
     Standing,
 )
-from pipelines.sfm.source import Source, camera_groups
+from pipelines.sfm.source import Source, camera_groups, unknown_lenses
 from pipelines.sfm.turning import focal_of_turning, is_turning
 from pipelines.sfm.wide_lenses import probing_pairs, recognised
 from pipelines.sfm.zooms import lens_changes
 from pipelines.stage import StageContext
 from pipelines.tools.colmap import Reconstructor
+from pipelines.tools.colmap_lenses import LensTrials
 from pipelines.tools.colmap_placing import num_tidying_steps
 from pipelines.tools.colmap_results import (
     PairStatistics,
@@ -118,6 +120,7 @@ class Ladder:
         self._attempts: list[Attempt] = []
         self._statistics = PairStatistics.nothing(len(source.files))
         self._sides: Sides = ()
+        self._lenses: Lenses = ()
 
     @property
     def outcome(self) -> Outcome:
@@ -363,14 +366,31 @@ class Ladder:
         mapped = span[0] + _MAPPED * (span[1] - span[0]) if keys else placed
         counted = (len(keys), "placing key frame") if keys else (num, "placing image")
         watch = self._progress.watch((span[0], mapped), *counted)
-        mapping = mended(
-            self._reconstructor,
-            lambda reconstructor: reconstructor.map(settings, watch, keys),
-            self._clips(keys),
-            is_film=self._source.is_video,
-            logger=self._ctx.logger,
-            sides=self._sides,
-        )
+
+        def mapped_by(lenses: Lenses) -> Mapping:
+            return mended(
+                self._reconstructor.with_cameras(lenses) if lenses else self._reconstructor,
+                lambda reconstructor: reconstructor.map(settings, watch, keys),
+                self._clips(keys),
+                is_film=self._source.is_video,
+                logger=self._ctx.logger,
+                sides=self._sides,
+            )
+
+        mapping = mapped_by(self._lenses)
+        settled: Settled = "known"
+        alike = unknown_lenses(self._source, self._options.camera_model)
+        if alike:
+            mapping, self._lenses, settled = told_apart(
+                mapping,
+                mapped_by,
+                alike,
+                self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES),
+                lambda made, model: own_lenses(self._trials(made, model), alike),
+                self._statistics.best_inliers.tolist(),
+                self._ctx.logger,
+                self._lenses,
+            )
         self._sides = mapping.sides or self._sides
         models = mapping.models
         most = best_model(models)
@@ -401,6 +421,7 @@ class Ladder:
             mapping.torn,
             mapping.left_out,
             is_one_side=bool(mapping.sides),
+            lenses=settled,
         )
         self._attempts.append(attempt)
         self._ctx.logger.info(
@@ -412,6 +433,14 @@ class Ladder:
             num,
             [len(model.indices) for model in models],
             [None if model.agreement is None else round(model.agreement, 3) for model in models],
+        )
+
+    def _trials(self, mapping: Mapping, model: SparseModel) -> LensTrials:
+        return mapping.reconstructor.lens_trials(
+            model,
+            lambda _: self._ctx.check_cancelled(),
+            refine_principal_point=False,
+            every_image=True,
         )
 
     def _clips(self, keys: list[int]) -> Sequence[Sequence[int]]:

@@ -14,8 +14,9 @@ from typing import Any
 from pipelines.errors import PipelineError, PosesError
 from pipelines.options import PosesOptions
 from pipelines.scene.orientation import normalise, opengl_from_opencv
-from pipelines.sfm.agreement import LITTLE
+from pipelines.sfm.agreement import LITTLE, MUCH
 from pipelines.sfm.intrinsics import LensVerdict, lens_warnings
+from pipelines.sfm.lens_groups import Settled
 from pipelines.sfm.rungs import RUNGS, Rung
 from pipelines.sfm.source import Source
 from pipelines.sfm.turning import is_turning
@@ -48,7 +49,8 @@ class Attempt:
     """One run of the mapper. matcher: which pairs. models: all it found, in COLMAP's order. torn:
     images of a film between which the best model's path is torn. left_out: pairs of images that
     matched, and were not used as they lay one side over another (`pipelines.sfm.tears`, `folds`).
-    is_one_side: whether these alone joined what is now apart."""
+    is_one_side: whether these alone joined what is now apart. lenses: whether it is known which
+    images share a lens (`pipelines.sfm.lens_groups`)."""
 
     rung: Rung
     matcher: str
@@ -57,6 +59,7 @@ class Attempt:
     torn: tuple[tuple[int, int], ...] = ()
     left_out: frozenset[tuple[int, int]] = frozenset()
     is_one_side: bool = False
+    lenses: Settled = "known"
 
     @property
     def best(self) -> SparseModel | None:
@@ -250,6 +253,7 @@ def build_report(outcome: Outcome, source: Source) -> dict[str, Any]:
                 "seconds": round(attempt.seconds, 2),
                 "torn": [[source.files[i] for i in pair] for pair in attempt.torn],
                 "pairs_left_out": len(attempt.left_out),
+                "lenses": attempt.lenses,
                 "chosen": attempt is chosen,
             }
             for attempt in outcome.attempts
@@ -300,6 +304,28 @@ def doubts_of(model: SparseModel) -> list[dict[str, Any]]:
             "hint": "Avoid mirrors and things that look the same from several sides, or film more "
             "of what stands around them.",
             "details": {"agreement": round(model.agreement, 4)},
+        }
+    ]
+
+
+def mixed_lens_warnings(outcome: Outcome) -> list[dict[str, Any]]:
+    """What is to be told of photos that seem to have several lenses, which were not told apart; or
+    that may have, as matches speak against their poses."""
+    chosen = outcome.chosen
+    agreed = None if chosen.best is None else chosen.best.agreement
+    is_low = chosen.lenses == "unsuspected" and agreed is not None and agreed < MUCH
+    if chosen.lenses != "doubtful" and not is_low:
+        return []
+    few = "" if agreed is None else f", and only {agreed:.0%} of what they show agrees with them"
+    seem = "seem to be" if chosen.lenses == "doubtful" else "may be"
+    return [
+        {
+            "code": "lenses_unsettled",
+            "message": "Nothing in the photos says through which lens they were taken; they "
+            f"{seem} of several, or zoomed, and could not be told apart{few}: poses may be wrong.",
+            "hint": "Send the originals with their EXIF, not copies from a messenger, or take all "
+            "photos through one lens without zooming or cropping.",
+            "details": {"agreement": None if agreed is None else round(agreed, 4)},
         }
     ]
 

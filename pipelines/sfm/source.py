@@ -192,6 +192,16 @@ def camera_groups(source: Source, lens: str) -> tuple[CameraGroup, ...]:
     return tuple(_group(indices, key[0], focal_px[key]) for key, indices in members.items())
 
 
+def unknown_lenses(source: Source, wanted: str) -> list[tuple[int, ...]]:
+    """The photos of which nothing says whether they share a lens, those of one size together; none
+    of a film, beside panoramas, or where a fisheye is wanted (`poses.camera_model`), whose focal
+    length is known by itself."""
+    if source.is_video or source.has_panoramas or wanted == "OPENCV_FISHEYE":
+        return []
+    groups = camera_groups(source, wanted)
+    return [tuple(group.indices) for group in groups if group.focal_px is None]
+
+
 def prior_focal_px(exif: Mapping[str, Any], width: int, height: int) -> float | None:
     """The focal length in pixels of a picture of that size, by its EXIF; None where it is silent.
 

@@ -34,6 +34,7 @@ from pipelines.sfm.intrinsics import LensVerdict, lens_warnings, settle_lenses, 
 from pipelines.sfm.report import (
     build_report,
     check_usable,
+    mixed_lens_warnings,
     path_warnings,
     report_of_failure,
     report_of_model,
@@ -178,7 +179,11 @@ def _found(options: PosesOptions, ctx: StageContext) -> dict[str, Any]:
         "clips": clips_of(outcome, source),
     }
     report["subpixel"] = refinement
-    found_wrong = [*path_warnings(outcome, source), *clip_warnings(report["clips"])]
+    found_wrong = [
+        *path_warnings(outcome, source),
+        *mixed_lens_warnings(outcome),
+        *clip_warnings(report["clips"]),
+    ]
     report["warnings"] = [*report["warnings"], *found_wrong]
     for warning in found_wrong:
         ctx.logger.warning("%s", warning["message"])

@@ -127,6 +127,15 @@ class Reconstructor:
         forget_pairs(other.database, self.names, pairs)
         return other
 
+    def with_cameras(self, cameras: Iterable[tuple[Sequence[int], float]]) -> Reconstructor:
+        """The same images with a copy of the database, in the scratch folder, in which some have
+        cameras of their own, as `give_own_camera` gives them. Not while a call runs."""
+        other = self.on(self.scratch / f"cameras-{uuid.uuid4().hex}.db")
+        shutil.copyfile(self.database, other.database)
+        for indices, scale in cameras:
+            other.give_own_camera(indices, scale)
+        return other
+
     def count_features(self, indices: Sequence[int], settings: FeatureSettings) -> list[int]:
         """How many features a few images would get; the database is left as it is."""
         probe = self.scratch / "probe.db"
@@ -296,9 +305,15 @@ class Reconstructor:
         return read
 
     def lens_trials(
-        self, model: SparseModel, watch: Watch, *, refine_principal_point: bool
+        self,
+        model: SparseModel,
+        watch: Watch,
+        *,
+        refine_principal_point: bool,
+        every_image: bool = False,
     ) -> LensTrials:
-        """Trials of other lenses on a model that `map` found. watch: see `runner`."""
+        """Trials of other lenses on a model that `map` found. watch: see `runner`. every_image: as
+        in `LensTrials`."""
         if model.stored is None:
             raise ValueError("the model was not written by COLMAP")
         return LensTrials(
@@ -307,6 +322,7 @@ class Reconstructor:
             num_threads=self.num_threads,
             seed=self.seed,
             run=self.runner(watch),
+            every_image=every_image,
         )
 
     def matched(self, pairs: Sequence[tuple[int, int]]) -> MatchedPairs:

@@ -12,7 +12,7 @@ by COLMAP's camera id.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ import numpy.typing as npt
 import pycolmap
 
 from pipelines.tools.colmap_adjustment import Rounds, Run, adjust
-from pipelines.tools.colmap_results import LENS_PARAMETERS, SparseModel, sparse_model
+from pipelines.tools.colmap_focals import focals_of_images, with_own_cameras
+from pipelines.tools.colmap_results import LENS_PARAMETERS, SparseModel, image_index, sparse_model
 
 Floats = npt.NDArray[np.float64]
 
@@ -38,6 +39,8 @@ pose and to tell lenses apart, and a fraction of what mapping adjusts many times
 MOST_IMAGES, FEWEST_OF_CAMERA = 150, 20
 """Images that tell of lenses, and how many of each camera at least, evenly out of all it took: a
 lens is told by as many of a long film as of a short one."""
+_OWN_ENDS = Rounds(iterations=20, rounds=3, tolerance=1e-5)
+"""Of focal lengths by image, which have far to go where one was shared by two lenses."""
 _ENDS = Rounds(iterations=10, rounds=5, tolerance=1e-6)
 """COLMAP's own tolerance goes on for 2 to 3 times as many rounds, for errors that are equal in four
 digits."""
@@ -62,11 +65,23 @@ class Fit:
         return {camera: (x + y) / 2 for camera, (x, y) in self.focal_xy_px.items()}
 
 
+@dataclass(frozen=True)
+class OwnFocals:
+    """What comes of it where each image has a focal length of its own.
+
+    focal_px: by the images' places in the capture. errors_px: as in `Fit`.
+    """
+
+    focal_px: dict[int, float]
+    errors_px: Floats
+
+
 class LensTrials:
     """Trials on one model, all with the same observations held out.
 
     folder: where COLMAP wrote the model. cameras: lens by camera id, as it was mapped. num_views:
-    images by camera id. image_of, camera_of: [H] ids of the held-out observations.
+    images by camera id. image_of, camera_of: [H] ids of the held-out observations. every_image:
+    whether all images tell, of how many ever.
     """
 
     def __init__(
@@ -77,6 +92,7 @@ class LensTrials:
         num_threads: int,
         seed: int,
         run: Run,
+        every_image: bool = False,
     ) -> None:
         self._run = run
         self._principal = refine_principal_point
@@ -87,7 +103,9 @@ class LensTrials:
         used = sorted({image.camera_id for image in images})
         self.cameras = {i: str(self._whole.camera(i).model.name) for i in used}
         self.num_views = {i: sum(image.camera_id == i for image in images) for i in used}
-        told_by = _evenly_of_cameras(self._whole)
+        told_by = (
+            sorted(self._whole.reg_image_ids()) if every_image else _evenly_of_cameras(self._whole)
+        )
         self._part = _part_of(self._whole, told_by)
         held = self._hold_out(np.random.default_rng(seed), len(told_by))
         self._held_point = [point for point, _, _ in held]
@@ -147,6 +165,26 @@ class LensTrials:
             errors_px=self._errors(fitted),
             reconstruction=fitted,
         )
+
+    @property
+    def indices_held_out(self) -> npt.NDArray[np.int64]:
+        """Places in the capture of the images of the held-out observations, [H]."""
+        found = [image_index(self._whole.image(int(i)).name) for i in self.image_of]
+        return np.array(found, np.int64)
+
+    def fit_apart(self, indices: Collection[int]) -> OwnFocals:
+        """Adjust the tracks with a focal length of each of these images, given by their places in
+        the capture; distortions stay as they were mapped."""
+        apart = with_own_cameras(self._part, indices)
+        adjust(
+            apart,
+            _OWN_ENDS,
+            what="comparing focal lengths",
+            run=self._run,
+            num_threads=self._num_threads,
+            refine_distortion=False,
+        )
+        return OwnFocals(focals_of_images(apart, indices), self._errors(apart))
 
     def adopt(
         self, lenses: Mapping[int, str], focals_px: Mapping[int, float] | None = None
