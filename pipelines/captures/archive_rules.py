@@ -93,12 +93,22 @@ def is_junk(name: str) -> bool:
     )
 
 
+def _name_folders(archive: Archive) -> None:
+    """Write the separators of a zip that some Windows programs make, "\\", as all others do.
+
+    The names are checked afterwards, as if they had come so. A tar's stay: none is made that way.
+    """
+    if isinstance(archive, zipfile.ZipFile):
+        for info in archive.infolist():
+            info.filename = info.filename.replace("\\", "/")
+
+
 def _check_name(info: zipfile.ZipInfo) -> None:
     # ZipInfo.filename ends at the first NUL; the name as stored is in orig_filename.
-    name = info.orig_filename
+    name = info.filename
     bad = (
         not name
-        or "\0" in name
+        or "\0" in info.orig_filename
         or "\\" in name
         or name.startswith("/")
         or re.match(r"[A-Za-z]:", name)
@@ -282,6 +292,7 @@ def checked_entries(archive: Archive, limits: ArchiveLimits) -> dict[str, zipfil
             f"The archive has {len(entries)} entries; {limits.max_entries} are allowed.",
             "Send fewer pictures.",
         )
+    _name_folders(archive)
     for info in entries:
         _check_name(info)
         _check_type(info)

@@ -16,6 +16,7 @@ import pytest
 from pipelines.captures.archive_rules import ArchiveLimits, open_archive
 from pipelines.captures.magic import image_format, video_container
 from pipelines.captures.sniff import sniff
+from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 from tests.unit.pipelines.captures.archives import (
     llff_files,
@@ -231,12 +232,36 @@ def test_photos_of_phones_and_cameras_are_told_apart_from_films(
 
 
 @pytest.mark.parametrize(
-    "name", ["../evil.jpg", "a/../../evil.jpg", "/etc/evil.jpg", "C:evil.jpg", "a\\evil.jpg"]
+    "name",
+    [
+        *("../evil.jpg", "a/../../evil.jpg", "/etc/evil.jpg", "C:evil.jpg", ".."),
+        *(
+            "..\\evil.jpg",
+            "a\\..\\..\\evil.jpg",
+            "a/..\\evil.jpg",
+            "\\etc\\evil.jpg",
+            "C:\\evil.jpg",
+        ),
+        *("C:\\evil.jpg", "\\\\server\\evil.jpg", "a\\.."),
+    ],
 )
 def test_unsafe_names_are_refused(tmp_path: Path, name: str) -> None:
     assert code_of(write_zip(tmp_path / "c", {"a.jpg": picture(), name: picture()})) == (
         "archive_unsafe"
     )
+
+
+def test_folders_as_windows_programs_separate_them_are_read(tmp_path: Path) -> None:
+    files: dict[str, bytes | str] = {"shots\\": ""}
+    files |= {f"shots\\day 1\\{n}.jpg": picture(seed=n) for n in range(3)}
+    path = write_zip(tmp_path / "c", files | {"__MACOSX\\x.jpg": picture(), "d/e\\f.txt": "x"})
+    assert sniff(path, "c.zip").details["num_images"] == 3
+    with CaptureArchive(path, ArchiveLimits()) as archive:
+        assert archive.names == {*(f"shots/day 1/{n}.jpg" for n in range(3)), "d/e/f.txt"}
+        archive.extract("shots/day 1/2.jpg", tmp_path / "out.jpg")
+    assert (tmp_path / "out.jpg").read_bytes() == files["shots\\day 1\\2.jpg"]
+    both = write_zip(tmp_path / "d", {"a/b.jpg": picture(), "a\\b.jpg": picture(seed=1)})
+    assert code_of(both) == "archive_unsafe", "which of the two?"
 
 
 def test_name_with_nul_is_refused(tmp_path: Path) -> None:
