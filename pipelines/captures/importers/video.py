@@ -97,10 +97,15 @@ def _ticks(*stamps: bytes, default: int) -> int:
 
 @dataclass(frozen=True)
 class Checked:
-    """A video that can be used. info: with its true length and number of frames."""
+    """A video that can be used.
+
+    info: with its true length and number of frames. promised_s: of one that is cut off, how long
+    its index says that it is, None where it does not say.
+    """
 
     info: VideoInfo
     packets: Scan
+    promised_s: float | None = None
 
     @property
     def start_s(self) -> float:
@@ -113,7 +118,8 @@ class Checked:
 
     def warnings(self) -> list[str]:
         """What its sender should know."""
-        return _warnings(self.info)
+        cut_off = [_cut_off(self.info, self.promised_s)] if self.packets.is_cut_off else []
+        return cut_off + _warnings(self.info)
 
 
 def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int) -> Checked:
@@ -133,15 +139,16 @@ def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int
         if error.code == "tool_timeout":
             raise
         raise _undecodable(error) from error
-    if packets.is_cut_off:
+    num_frames = len(packets.times_s)
+    if packets.is_cut_off and num_frames < max(minimum, 1):
         raise CaptureError(
-            "The video is cut off: its index promises more than the file holds.",
+            f"The video is cut off: {num_frames} frames of it are there, and at least {minimum} "
+            "are needed.",
             code="video_truncated",
             hint="Upload the file again; it was not copied or recorded to its end.",
         )
     ctx.progress(0.7, "Decoding the first frames")
     _try_decoding(path, ctx, info.stream)
-    num_frames = len(packets.times_s)
     if num_frames < max(minimum, 1):
         raise CaptureError(
             f"The video has {num_frames} frames; at least {minimum} are needed.",
@@ -150,8 +157,9 @@ def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int
         )
     duration_s = packets.duration_s
     fps = info.fps or (num_frames / duration_s if duration_s > 0 else None)
+    promised_s = info.duration_s if packets.is_cut_off else None
     info = replace(info, num_frames=num_frames, duration_s=round(duration_s, 6), fps=fps)
-    return Checked(info, packets)
+    return Checked(info, packets, promised_s)
 
 
 def _check_size(info: VideoInfo, options: IngestOptions) -> None:
@@ -200,6 +208,15 @@ def _details(info: VideoInfo, packets: Scan) -> dict[str, object]:
         "variable_frame_rate": variable,
         "start_s": round(packets.times_s[0], 6),
     }
+
+
+def _cut_off(info: VideoInfo, promised_s: float | None) -> str:
+    there_s = info.duration_s or 0.0
+    share = f" of {promised_s:.1f} s ({100 * there_s / promised_s:.0f} %)" if promised_s else ""
+    return (
+        f"The video is cut off: its first {there_s:.1f} s{share} are there, and used. It was not "
+        "copied or recorded to its end; send it whole if you have it."
+    )
 
 
 def _warnings(info: VideoInfo) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -314,10 +315,23 @@ def test_cancel_stops_the_decoding(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("container", "options"), [("mp4", ["-movflags", "faststart"]), ("mkv", [])]
 )
-def test_cut_off_video_fails_at_ingest(tmp_path: Path, container: str, options: list[str]) -> None:
+def test_of_a_video_that_is_cut_off_what_is_there_is_used(
+    tmp_path: Path, container: str, options: list[str]
+) -> None:
     clip = make_clip(tmp_path / f"a.{container}", "testsrc2=s=320x180:r=30:d=4", *options)
     clip.write_bytes(clip.read_bytes()[: clip.stat().st_size * 2 // 3])
-    with pytest.raises(CaptureError) as caught:
+    warning = ingested(tmp_path, clip)["warnings"][0]
+    assert "The video is cut off: its first 2." in warning
+    assert re.search(r" of 4\.0 s \((6|7). %\) are there", warning)
+    summary, rows, _ = chosen(tmp_path, num_frames=20)
+    assert summary["num_frames"] >= 18
+    assert 2.0 < rows[-1]["timestamp_s"] < 3.0
+
+
+def test_a_video_of_which_next_to_nothing_is_there_is_refused(tmp_path: Path) -> None:
+    clip = make_clip(tmp_path / "a.mkv", "testsrc2=s=320x180:r=30:d=4")
+    clip.write_bytes(clip.read_bytes()[: clip.stat().st_size // 40])
+    with pytest.raises(CaptureError, match="cut off") as caught:
         ingested(tmp_path, clip)
     assert caught.value.code == "video_truncated"
 
