@@ -19,6 +19,7 @@ from pipelines.captures.importers.video import Checked, check
 from pipelines.captures.leftovers import as_details, leftover_warnings, leftovers
 from pipelines.captures.magic import video_container
 from pipelines.captures.minimum import MIN_IMAGES
+from pipelines.captures.pauses import Pause, without_pauses
 from pipelines.captures.record import Found
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
@@ -36,13 +37,15 @@ class Clip:
     """One clip.
 
     name: see the module. start_s: time of its first frame. video: as `VideoInfo`. num_views: how
-    many views are cut from each frame; 0 where frames are not panoramas.
+    many views are cut from each frame; 0 where frames are not panoramas. pauses: see
+    `captures.pauses`, by its own times.
     """
 
     name: str
     start_s: float
     video: dict[str, Any]
     num_views: int = 0
+    pauses: Sequence[Pause] = ()
 
     @property
     def num_frames(self) -> int:
@@ -56,8 +59,8 @@ class Clip:
 
     @property
     def length_s(self) -> float:
-        """How long it is shown."""
-        return max(self.end_s - self.start_s, 1e-6)
+        """How long it is shown, its pauses left out."""
+        return max(without_pauses(self.end_s, self.pauses) - self.start_s, 1e-6)
 
 
 def read_film(path: Path, options: IngestOptions, ctx: StageContext) -> Found:
@@ -177,7 +180,7 @@ def _clip_names(archive: CaptureArchive) -> list[str]:
 
 def _clip(name: str, checked: Checked, options: IngestOptions) -> Clip:
     num_views = options.panorama_views if checked.info.projection else 0
-    return Clip(name, checked.start_s, checked.info.as_dict(), num_views)
+    return Clip(name, checked.start_s, checked.info.as_dict(), num_views, checked.pauses)
 
 
 def _is_smaller(clip: Checked, other: Checked) -> bool:
@@ -185,7 +188,7 @@ def _is_smaller(clip: Checked, other: Checked) -> bool:
 
 
 def _check_length(clips: Sequence[Checked], options: IngestOptions) -> None:
-    duration_s = sum(clip.info.duration_s or 0.0 for clip in clips)
+    duration_s = sum(without_pauses(clip.info.duration_s or 0.0, clip.pauses) for clip in clips)
     if duration_s <= options.max_duration_s:
         return
     what = "The video is" if len(clips) == 1 else "The videos are together"

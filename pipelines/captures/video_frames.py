@@ -10,7 +10,7 @@ import math
 import queue
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +20,7 @@ import numpy.typing as npt
 import PIL.Image
 
 from pipelines.captures.hdr import TRANSFERS, sdr_filters, write_pq_table
+from pipelines.captures.pauses import Pause
 from pipelines.errors import ToolError
 from pipelines.stage import StageContext
 from pipelines.tools.ffmpeg import passthrough_timing, run_ffmpeg, untrusted_input
@@ -100,7 +101,8 @@ class DecodePlan:
 
     width, height: of the upright, reduced frames. hdr: as in `VideoInfo`. matrix: ffmpeg's name of
     the colour matrix to assume, or None for the one that the video names.
-    step_s: at most one frame is delivered per cell of this length (from `start_s` on); 0 for all.
+    step_s: at most one frame is delivered per cell of this length (from `start_s` on, on a clock
+    that stands still in the `pauses`); 0 for all.
     crop: the part of the upright, unreduced frames that is taken; None for all.
     stream: as in `VideoInfo`.
     """
@@ -113,6 +115,7 @@ class DecodePlan:
     step_s: float = 0.0
     crop: Crop | None = None
     stream: str = "0:V:0"
+    pauses: Sequence[Pause] = ()
 
 
 def reduced_size(width: int, height: int, long_side_px: int) -> tuple[int, int]:
@@ -128,8 +131,8 @@ def filter_chain(plan: DecodePlan, pq_table: Path | None = None) -> str:
     """
     parts = ["showinfo@all=checksum=0"]
     if plan.step_s > 0:
-        cell = f"floor(({{}}-{plan.start_s:.9f})/{plan.step_s:.9f})"
-        condition = f"gt({cell.format('t')},{cell.format('prev_selected_t')})"
+        cell, before = _cell(plan, "t"), _cell(plan, "prev_selected_t")
+        condition = f"gt({cell},{before})"
         parts.append(f"select='isnan(prev_selected_t)+{condition}'")
     parts.append("showinfo@kept=checksum=0")
     if plan.matrix is not None:
@@ -142,6 +145,13 @@ def filter_chain(plan: DecodePlan, pq_table: Path | None = None) -> str:
         parts += sdr_filters(plan.hdr, pq_table)
     parts.append("scale=out_color_matrix=bt601:out_range=full,format=yuv420p")
     return ",".join(parts)
+
+
+def _cell(plan: DecodePlan, time: str) -> str:
+    """ffmpeg's expression for the number of the cell that a time is in, as
+    `pauses.without_pauses` has it."""
+    passed = "".join(f"-{length_s:.9f}*gte({time},{at_s:.9f})" for at_s, length_s in plan.pauses)
+    return f"floor(({time}-{plan.start_s:.9f}{passed})/{plan.step_s:.9f})"
 
 
 class FrameTimes:

@@ -36,6 +36,7 @@ from pipelines.captures.minimum import MIN_IMAGES
 from pipelines.captures.motion import MotionMeter
 from pipelines.captures.panorama_files import FOLDER as PANORAMAS
 from pipelines.captures.panorama_files import write_views
+from pipelines.captures.pauses import Pause, without_pauses
 from pipelines.captures.record import CaptureRecord
 from pipelines.captures.video_frames import (
     Crop,
@@ -73,7 +74,8 @@ class _Windows:
     times are counted from. num_windows: 0 to keep every frame. start_s, length_s: of a window's
     grid, by the clip's own times. max_step: long sides by which the picture may move from one
     frame to the next, as far as MAX_PARTS and MAX_GROWTH allow; 0 for one frame a window.
-    num_views: cut from each frame, which is a panorama then.
+    num_views: cut from each frame, which is a panorama then. pauses: of the clip, of which no
+    window is.
     """
 
     out: Path
@@ -86,6 +88,7 @@ class _Windows:
     length_s: float
     max_step: float = 0.0
     num_views: int = 0
+    pauses: Sequence[Pause] = ()
     num_seen: int = 0
     num_kept: int = 0
     _best: dict[int, tuple[float, Frame]] = field(default_factory=dict)
@@ -158,7 +161,8 @@ class _Windows:
         """Its number, counted over all windows."""
         if self.num_windows == 0 or not math.isfinite(frame.time_s):
             return frame.index * SLOTS
-        cell = int((frame.time_s - self.start_s) / self.length_s * SLOTS)
+        shown_s = without_pauses(frame.time_s, self.pauses)
+        cell = int((shown_s - self.start_s) / self.length_s * SLOTS)
         return min(max(cell, 0), self.num_windows * SLOTS - 1)
 
 
@@ -325,6 +329,7 @@ def _decode_clip(
         length_s=clip.length_s / share,
         max_step=0.0 if clip.num_views else options.max_step,
         num_views=clip.num_views,
+        pauses=clip.pauses,
     )
     plan = DecodePlan(
         width=width,
@@ -335,6 +340,7 @@ def _decode_clip(
         step_s=_step(clip, share * options.candidates_per_frame),
         crop=crop,
         stream=clip.video["stream"],
+        pauses=clip.pauses,
     )
 
     def on_frame(frame: Frame) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.captures.panorama_files import EQUIRECTANGULAR
+from pipelines.captures.pauses import Pause, pauses_of, pauses_warning
 from pipelines.errors import CaptureError, ToolError
 from pipelines.options import IngestOptions
 from pipelines.scene.panoramas import is_whole
@@ -112,6 +113,11 @@ class Checked:
         """When its first frame is shown."""
         return round(self.packets.times_s[0], 6)
 
+    @property
+    def pauses(self) -> tuple[Pause, ...]:
+        """Stretches without frames."""
+        return pauses_of(self.packets.times_s)
+
     def details(self) -> dict[str, Any]:
         """For the record."""
         return _details(self.info, self.packets)
@@ -119,7 +125,8 @@ class Checked:
     def warnings(self) -> list[str]:
         """What its sender should know."""
         cut_off = [_cut_off(self.info, self.promised_s)] if self.packets.is_cut_off else []
-        return cut_off + _warnings(self.info)
+        pauses = [pauses_warning(self.pauses)] if self.pauses else []
+        return cut_off + pauses + _warnings(self.info)
 
 
 def check(path: Path, options: IngestOptions, ctx: StageContext, *, minimum: int) -> Checked:

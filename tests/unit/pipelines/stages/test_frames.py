@@ -125,6 +125,32 @@ def test_variable_frame_rate_is_chosen_by_time(tmp_path: Path) -> None:
         assert row["timestamp_s"] == pytest.approx(times[number], abs=0.01)
 
 
+@pytest.mark.parametrize("candidates", [3, 60], ids=["some", "all"])
+@pytest.mark.parametrize(("first_late", "by_s"), [(30, 600), (58, 900), (58, 3000)])
+def test_a_pause_takes_no_frames_from_the_rest(
+    tmp_path: Path, first_late: int, by_s: int, candidates: int
+) -> None:
+    """A recording that stood still for minutes, or a last time stamp far off: 60 frames, 20 wanted
+    of them."""
+    marked_pictures(tmp_path / "p", 60, blurred=set())
+    clip = tmp_path / "a.mkv"
+    clock = f"settb=1/1000,setpts='N*50+if(lt(N,{first_late}),0,{by_s}000)'"
+    ffmpeg(
+        "-framerate", "50", "-i", tmp_path / "p" / "%04d.png", "-vf", clock,
+        "-fps_mode", "passthrough", "-enc_time_base", "1:1000", "-pix_fmt", "yuv420p", clip,
+    )  # fmt: skip
+    told = "\n".join(ingested(tmp_path, clip)["warnings"])
+    assert f"a pause of {by_s} s without pictures" in told
+    _, rows, out = chosen(tmp_path, num_frames=20, max_step=0.0, candidates_per_frame=candidates)
+    assert len(rows) == 20
+    numbers = [row["source_frame_index"] for row in rows]
+    assert [number // 3 for number in numbers] == pytest.approx(range(20), abs=1)
+    for row, number in zip(rows, numbers, strict=True):
+        assert number == number_in(out / row["file"])
+        late_s = by_s if number >= first_late else 0
+        assert row["timestamp_s"] == pytest.approx(number * 0.05 + late_s, abs=0.01)
+
+
 @pytest.mark.parametrize(("degrees", "corner"), [(90, (0, -1)), (180, (-1, -1)), (270, (-1, 0))])
 def test_frames_are_upright(tmp_path: Path, degrees: int, corner: tuple[int, int]) -> None:
     """A white mark in the stored top left corner lies where a player would show it."""
