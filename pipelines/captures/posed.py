@@ -22,6 +22,7 @@ from pipelines.captures.parsing import malformed
 from pipelines.captures.photo_masks import NO_MASKS, PhotoMasks, find_masks
 from pipelines.captures.pictures import Picture, PictureWriter, evenly_picked
 from pipelines.captures.pose_order import proven
+from pipelines.captures.posed_copies import without_copies
 from pipelines.captures.record import Found, FoundPoints
 from pipelines.captures.storing import store_each
 from pipelines.captures.unpack import CaptureArchive
@@ -68,7 +69,8 @@ def write_posed(
     """
     if capture.readings:
         capture = proven(archive, capture, options, ctx)
-    sources, num_passed_over = capture.sources, 0
+    sources = without_copies(archive, capture.sources, options.max_pixels)
+    num_passed_over = 0
     if capture.is_dense:
         picked = evenly_picked(len(sources), options.max_posed_images)
         kept = set(picked)

@@ -167,3 +167,30 @@ def test_a_time_that_is_none_costs_its_frame(tmp_path: Path, time: Any) -> None:
     summary, _ = ingest(tmp_path, with_times([n / 10 for n in range(10)] + [time]))
     assert summary["num_posed"] in (10, 11)
     assert warning_with(summary, "Motion is not modelled")
+
+
+def test_splits_that_list_the_same_pictures_count_once(tmp_path: Path) -> None:
+    """By their bytes, or by their pixels where one was packed anew; with one pose."""
+    files = blender_files(train=6)
+    frames = json.loads(files["transforms_train.json"])["frames"]
+    for split in ("val", "test"):
+        for frame in frames:
+            name = frame["file_path"].removeprefix("./train/")
+            files[f"{split}/{name}.png"] = files[f"train/{name}.png"]
+        again = [
+            {**frame, "file_path": frame["file_path"].replace("train", split)} for frame in frames
+        ]
+        files[f"transforms_{split}.json"] = json.dumps({"camera_angle_x": ANGLE, "frames": again})
+    stream = io.BytesIO()
+    PIL.Image.open(io.BytesIO(files["test/r_0.png"])).save(stream, "PNG", compress_level=1)
+    files["test/r_0.png"] = stream.getvalue()
+    summary, ctx = ingest(tmp_path, files)
+    assert sources(ctx) == [f"train/r_{n}.png" for n in range(6)]
+    assert warning_with(summary, "6 pictures in val/", "6 pictures in test/", "with the same pose")
+
+
+def test_the_same_picture_with_another_pose_counts(tmp_path: Path) -> None:
+    files = blender_files(train=5, val=5)
+    files |= {f"val/r_{n}.png": files[f"train/r_{n}.png"] for n in range(5)}
+    _, ctx = ingest(tmp_path, files)
+    assert len(sources(ctx)) == 10

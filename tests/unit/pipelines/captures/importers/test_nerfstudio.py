@@ -114,7 +114,15 @@ def test_path_out_of_the_archive_leads_nowhere(tmp_path: Path, path: str) -> Non
 
 
 @pytest.mark.parametrize(
-    "folder", ["/home/somebody/scan/images/", "C:\\scan\\images\\", "../images/", "elsewhere/", ""]
+    "folder",
+    [
+        "/home/somebody/scan/images/",
+        "C:\\scan\\images\\",
+        "../slike\\",
+        "../images/",
+        "elsewhere/",
+        "",
+    ],
 )
 def test_paths_of_another_machine_are_matched_by_the_end_of_the_name(
     tmp_path: Path, folder: str
