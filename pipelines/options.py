@@ -95,9 +95,7 @@ class FramesOptions(StageOptions):
     )
     jpeg_quality: int = Field(95, ge=50, le=100, description="JPEG quality of the frames kept.")
     find_burned_in: bool = Field(
-        True,
-        description="Cut away bars beside the pictures, and ignore what lies over all of them in "
-        "one place: a date, a logo, a recorded screen's buttons.",
+        True, description="Cut bars off films, and ignore dates and logos that lie over all frames."
     )
 
 

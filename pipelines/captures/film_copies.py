@@ -170,4 +170,5 @@ def _normal(look: Look) -> Look:
     """Without its mean, of length 1; all zeros where it is flat."""
     plain = look - look.mean()
     length = float(np.sqrt((plain**2).sum()))
-    return plain / length if length > 0 else plain
+    normal: Look = plain / length if length > 0 else plain
+    return normal

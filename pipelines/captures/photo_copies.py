@@ -167,4 +167,5 @@ def _normal(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Without their mean, of length 1; zeros where they are all alike."""
     plain = values - values.mean()
     length = float(np.sqrt((plain**2).sum()))
-    return plain / length if length > 0 else plain
+    normal: NDArray[np.float32] = plain / length if length > 0 else plain
+    return normal

@@ -20,11 +20,9 @@ from api.client import cli
 from api.client.client import Client
 from api.client.display import (
     clean,
-    duration,
     print_job,
     print_warnings,
     quality_rows,
-    size,
     watch_job,
 )
 from pipelines.presets import PRESETS
@@ -442,23 +440,6 @@ def test_results_show_what_was_not_measured(tmp_path: Path) -> None:
     assert rows["held-out PSNR"] == rows["held-out SSIM"] == "not measured"
     assert dict(quality_rows(REPORT))["images registered"] == "46 of 50 (92%)"
     assert dict(quality_rows(REPORT))["held-out images"] == "5, 480 x 270 px"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.4, "0 s"), (59.6, "1 m 00 s"), (125, "2 m 05 s"), (3725, "1 h 02 m"), (-3, "0 s")],
-)
-def test_durations_read_well(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
-
-
-def test_sizes_read_well() -> None:
-    assert [size(0), size(999), size(1500), size(2_500_000_000)] == [
-        "0 B",
-        "999 B",
-        "1.5 kB",
-        "2.5 GB",
-    ]
 
 
 def test_text_of_a_service_cannot_steer_the_terminal() -> None:

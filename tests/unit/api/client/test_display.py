@@ -91,3 +91,25 @@ def test_stages_that_run_at_once_are_all_told_when_it_is_time(
         for percents in ((10, 5), (20, 10), (30, 15))
         for name, percent in zip(("mesh", "video"), percents, strict=True)
     ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.4, "0 s"), (59.6, "1 m 00 s"), (125, "2 m 05 s"), (3725, "1 h 02 m"), (-3, "0 s")],
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert display.duration(seconds) == text
+
+
+def test_sizes_read_well() -> None:
+    assert [
+        display.size(0),
+        display.size(999),
+        display.size(1500),
+        display.size(2_500_000_000),
+    ] == [
+        "0 B",
+        "999 B",
+        "1.5 kB",
+        "2.5 GB",
+    ]

@@ -181,8 +181,9 @@ def test_splits_that_list_the_same_pictures_count_once(tmp_path: Path) -> None:
             {**frame, "file_path": frame["file_path"].replace("train", split)} for frame in frames
         ]
         files[f"transforms_{split}.json"] = json.dumps({"camera_angle_x": ANGLE, "frames": again})
-    stream = io.BytesIO()
-    PIL.Image.open(io.BytesIO(files["test/r_0.png"])).save(stream, "PNG", compress_level=1)
+    stream, whole = io.BytesIO(), files["test/r_0.png"]
+    assert isinstance(whole, bytes)
+    PIL.Image.open(io.BytesIO(whole)).save(stream, "PNG", compress_level=1)
     files["test/r_0.png"] = stream.getvalue()
     summary, ctx = ingest(tmp_path, files)
     assert sources(ctx) == [f"train/r_{n}.png" for n in range(6)]

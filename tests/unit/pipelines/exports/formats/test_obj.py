@@ -69,12 +69,12 @@ def test_a_closed_surface_with_a_picture_stays_closed(tmp_path: Path) -> None:
     faces = np.asarray(ball.faces, np.int32)
     chart = unwrap(ball.vertices, faces, np.full(len(faces), 100.0), 1024)
     assert len(chart.vertex) > 1.2 * len(ball.vertices), "there are seams"
-    picture = np.zeros((chart.side, chart.side, 3), np.uint8)
+    picture = np.zeros((chart.size[1], chart.size[0], 3), np.uint8)
     painted = TexturedMesh(
         np.asarray(ball.vertices)[chart.vertex],
         chart.faces,
         np.asarray(ball.vertex_normals)[chart.vertex],
-        chart.uv / chart.side,
+        chart.uv / np.array(chart.size),
         picture,
     )
     path = unpacked(tmp_path, painted)
