@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=21,
+        version=22,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",
