@@ -55,9 +55,9 @@ OPTIONS: dict[str, Any] = {
 
 
 def options_of(stage: str, **changes: Any) -> dict[str, Any]:
-    """The tiny options of a stage, with changes on top."""
+    """The tiny options of a stage, with changes laid over them."""
     overrides = {**OPTIONS, stage: {**OPTIONS.get(stage, {}), **changes}}
-    return resolve_options("preview", overrides)[stage]
+    return resolve_options("preview", overrides, is_request=False)[stage]
 
 
 def make_capture(

@@ -94,7 +94,7 @@ def test_the_method_is_that_of_where_the_cameras_look(
 ) -> None:
     """Whatever is asked for of it: at a bowl here, and be it from one side."""
     plain = {"texture": "none", "refine": "none"}
-    crop = {"shape": "sphere", "center": (0.0, 0.0, 0.0), "size": (4.0, 4.0, 4.0)}
+    crop = {"shape": "sphere", "center": (0.0, 0.0, 0.0), "radius": 2.0}
     for asked in ({}, {"extent": "scene"}, {"crop": crop}):
         assert tiny_job.run(job, "mesh", **plain, **asked)["summary"]["method"] == "poisson", asked
     monkeypatch.setattr(gaze, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
@@ -126,7 +126,7 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
     assert len(painted.faces) == len(mesh.faces)
     assert list(painted.texture.shape[1::-1]) == summary["texture_size_px"]
     assert max(summary["texture_size_px"]) == summary["texture_px"]
-    assert 0.1 < summary["texture_filled"] < 1.0
+    assert 0.05 < summary["texture_filled"] < 1.0, "small charts are mostly gutter"
     corners = painted.vertices[painted.faces]
     assert np.abs(corners - mesh.points[mesh.faces]).max() < 1e-4
     for spoil in ({"texture": "none"}, {"texture_px": 512, "max_faces": 100_000}):

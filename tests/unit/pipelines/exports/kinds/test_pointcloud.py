@@ -186,7 +186,7 @@ def test_a_subject_asked_for_is_what_a_mesh_is_cropped_to(job: Workspace) -> Non
     assert np.median(off) < 0.08 * max(region["size"])
     # A crop says what is kept: nothing else is decided.
     crop = {"shape": "box", **region}
-    cropped = tiny_job.run(job, "pointcloud", extent="subject", crop=crop)["summary"]
+    cropped = tiny_job.run(job, "pointcloud", crop=crop)["summary"]
     assert cropped["subject"] is None
 
 

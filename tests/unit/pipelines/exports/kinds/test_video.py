@@ -80,7 +80,7 @@ def test_a_cancel_in_the_middle_leaves_nothing(job: Workspace) -> None:
 
 @pytest.mark.parametrize("codec", ["hevc", "av1"])
 def test_other_codecs_are_what_they_say(job: Workspace, codec: str) -> None:
-    wanted = {"codec": codec, "width_px": 96, "height_px": 80, "seconds": 0.5, "fps": 20.0}
+    wanted = {"codec": codec, "width_px": 96, "height_px": 80, "num_frames": 10, "fps": 20.0}
     summary = tiny_job.run(job, "video", **wanted)["summary"]
     path = job.stage("video") / "video.mp4"
     info = probe(path)
