@@ -123,17 +123,22 @@ def texture_from_photos(
     charts = cut(mesh.faces, choice, places, flat)
     layout = lay_out(charts, photos.size, largest_side, poll)
     on_progress(_CUT_SHARE)
-    picture, colors = _copied(
+    picture, laid, colors = _copied(
         charts,
         layout,
         photos,
         lambda done: on_progress(_CUT_SHARE + (_COPY_SHARE - _CUT_SHARE) * done),
     )
     added = levels(charts, colors, moving(on_progress, _COPY_SHARE, _LEVEL_SHARE, _MOST_POLLS))
-    calls = -(-layout.size[1] // ROWS) + 4 * MARGIN_PX
+    calls = -(-layout.size[1] // ROWS) + 4 * MARGIN_PX * (1 + refined)
     told = moving(on_progress, _LEVEL_SHARE, _ADD_SHARE, calls)
-    known = _level(picture, charts, layout, added, told)
-    spread(picture, known, MARGIN_PX, told)
+    covered, known = _level(picture, charts, layout, added, told)
+    known &= laid
+    if refined:
+        # What a patch shows around its faces may lie behind them: at a pixel that mixes both, the
+        # face would make up for it.
+        known = covered
+        spread(picture, known, MARGIN_PX, told)
     gradients = Gradients(charts, layout)
     known[gradients.rows, gradients.columns] = True
     own: NDArray[np.floating[Any]] = mesh.colors
@@ -158,10 +163,12 @@ def texture_from_photos(
 
 def _copied(
     charts: Charts, layout: Layout, photos: Photos, on_progress: Callable[[float], None]
-) -> tuple[Bytes, Floats]:
-    """The patches in their places, and each corner's colour in its photo, [U, 3]."""
+) -> tuple[Bytes, NDArray[np.bool_], Floats]:
+    """The patches in their places [H, W, 3], where any is [H, W], and each corner's colour in its
+    photo, [U, 3]."""
     width, height = layout.size
     picture = np.zeros((height, width, 3), np.uint8)
+    laid = np.zeros((height, width), np.bool_)
     colors = np.full((len(charts.vertex), 3), np.nan)
     by_photo = charts.photo[layout.charts]
     used = np.unique(by_photo)
@@ -177,34 +184,39 @@ def _copied(
                 patch = np.asarray(
                     photo.resize(size, Image.Resampling.BOX, (left, top, right, bottom))
                 )
-            layout.packing.lay(int(layout.charts[row]), patch, picture)
+            laid[layout.packing.lay(int(layout.charts[row]), patch, picture)] = True
         mine = charts.photo[charts.chart] == index
         colors[mine] = colors_at(softened(photo), charts.place[mine])
         on_progress(done / len(used))
-    return picture, colors
+    return picture, laid, colors
 
 
 def _level(
     picture: Bytes, charts: Charts, layout: Layout, added: Floats, on_rows: Callable[[], None]
-) -> NDArray[np.bool_]:
-    """Add what each corner needs, and between corners what lies between, in place.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Add what each corner needs, and between corners and beside faces what lies there, in place.
 
-    Returns which texels [H, W] are on faces that a photo shows, or all of a patch with none.
+    Returns which texels [H, W] are on faces that a photo shows, or all of a patch with none; and
+    these with their margins.
     """
     shown = charts.photo[charts.face_chart] != NOBODY
     covered = np.zeros(picture.shape[:2], np.bool_)
     if not shown.any():
-        return covered
+        return covered, covered.copy()
     faces, chart = charts.faces[shown], charts.face_chart[shown]
     missed = np.ones(len(charts.photo), np.bool_)
+    steps = np.zeros(picture.shape, np.int16)
     for texels in texels_of(layout.uv, faces, layout.size):
         values = np.einsum("nc,ncd->nd", texels.weights, added[faces[texels.face]])
-        moved = picture[texels.rows][texels.covered] + 255.0 * values
-        picture[texels.rows][texels.covered] = np.rint(np.clip(moved, 0.0, 255.0))
+        values = np.rint(255.0 * values)
+        steps[texels.rows][texels.covered] = np.clip(values, -255, 255).astype(np.int16)
         covered[texels.rows] = texels.covered
         missed[chart[texels.face]] = False
         on_rows()
     for one in layout.charts[missed[layout.charts]].tolist():
-        rows, columns = layout.packing.texels(one)
-        covered[rows, columns] = True
-    return covered
+        covered[layout.packing.texels(one)] = True
+    grown = covered.copy()
+    spread(steps, grown, MARGIN_PX, on_rows)
+    np.clip(picture + steps, 0, 255, out=steps)
+    picture[:] = steps.astype(np.uint8)
+    return covered, grown

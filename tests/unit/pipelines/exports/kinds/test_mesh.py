@@ -126,7 +126,7 @@ def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
     assert len(painted.faces) == len(mesh.faces)
     assert list(painted.texture.shape[1::-1]) == summary["texture_size_px"]
     assert max(summary["texture_size_px"]) == summary["texture_px"]
-    assert 0.05 < summary["texture_filled"] < 1.0, "small charts are mostly gutter"
+    assert 0.02 < summary["texture_filled"] < 1.0
     corners = painted.vertices[painted.faces]
     assert np.abs(corners - mesh.points[mesh.faces]).max() < 1e-4
     for spoil in ({"texture": "none"}, {"texture_px": 512, "max_faces": 100_000}):

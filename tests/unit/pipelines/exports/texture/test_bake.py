@@ -156,10 +156,13 @@ def off_in_copies(textured: TexturedMesh, which: np.ndarray, copy: int) -> np.nd
 
 
 def two_colored(resolution: int = 48) -> TriangleMesh:
-    """The ball, its vertices red above and dark blue below: what lies beside what tells."""
+    """The ball, its vertices red above and dark blue below, its faces in any order, as those of
+    surfaces are: what lies beside what in the picture tells."""
     mesh = painted_ball.ball(resolution)
     above = (mesh.vertices[:, 2] > CENTER[2])[:, None]
-    return dataclasses.replace(mesh, colors=np.where(above, [0.9, 0.2, 0.1], [0.1, 0.1, 0.4]))
+    colors = np.where(above, [0.9, 0.2, 0.1], [0.1, 0.1, 0.4])
+    faces = np.random.default_rng(0).permutation(mesh.faces)
+    return dataclasses.replace(mesh, faces=faces, colors=colors)
 
 
 @pytest.mark.parametrize("refined", [False, True])
