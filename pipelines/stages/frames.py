@@ -91,6 +91,10 @@ class _Windows:
     pauses: Sequence[Pause] = ()
     num_seen: int = 0
     num_kept: int = 0
+    repeated: list[int] = field(default_factory=list)
+    """Places in `rows` of frames that show what the one chosen before shows."""
+    _last: Frame | None = None
+    """The frame chosen last that does not."""
     _best: dict[int, tuple[float, Frame]] = field(default_factory=dict)
     """Of each slot of the window: sharpness and frame."""
     _window: int = -1
@@ -122,10 +126,34 @@ class _Windows:
             slots = range(part * SLOTS // num_parts, (part + 1) * SLOTS // num_parts)
             found = [self._best[slot] for slot in slots if slot in self._best]
             sharpness, frame = max(found, key=lambda each: each[0], default=(0.0, None))
-            if frame is not None and sharpness >= sharp_enough:
-                self._write(sharpness, frame)
+            if frame is None or sharpness < sharp_enough:
+                continue
+            if self._last is not None and frame.repeats(self._last):
+                self.repeated.append(len(self.rows))
+            else:
+                self._last = frame
+            self._write(sharpness, frame)
         self._best.clear()
         self._speeds.clear()
+
+    def drop_repeated(self) -> int:
+        """Delete frames that repeat others, at the end; returns how many.
+
+        None of panoramas, and none where hardly any other would be left: what a camera that stood
+        still has filmed is for structure from motion to judge.
+        """
+        num_left = self.num_kept - len(self.repeated)
+        if not self.repeated or self.num_views or num_left < MIN_IMAGES:
+            return 0
+        for place in reversed(self.repeated):
+            (self.out / self.rows.pop(place)["file"]).unlink()
+        for number, row in enumerate(self.rows, start=1):
+            file = f"images/frame_{number:05d}.jpg"
+            if not row.get("views"):
+                (self.out / row["file"]).rename(self.out / file)
+                row["file"] = file
+        self.num_kept = num_left
+        return len(self.repeated)
 
     def _num_parts(self) -> int:
         """How many frames the window gives: by how far the picture moved in it."""
@@ -267,6 +295,7 @@ class _Read:
     num_decoded: int
     num_seen: int
     num_kept: int
+    num_repeated: int
     burned_in: float = 0.0
 
 
@@ -350,7 +379,15 @@ def _decode_clip(
     with clip_file(ctx.workspace.capture_file, clip, ctx.out) as file:
         num_decoded = decode(file, plan, ctx, on_frame)
     windows.flush()
-    return _Read(plan, scale.offset_s, num_decoded, windows.num_seen, windows.num_kept)
+    num_repeated = windows.drop_repeated()
+    return _Read(
+        plan,
+        scale.offset_s,
+        num_decoded,
+        windows.num_seen,
+        windows.num_kept,
+        num_repeated,
+    )
 
 
 def _step(clip: Clip, wanted: int) -> float:
@@ -387,6 +424,11 @@ def _warnings(clip: Clip, read: _Read, where: str) -> list[str]:
         warnings.append(
             f"{read.num_decoded} of {clip.num_frames} frames{where} could be decoded; the video is "
             "damaged."
+        )
+    if read.num_repeated:
+        warnings.append(
+            f"{read.num_repeated} frames{where} show what the one before shows, and were left out: "
+            "the camera stood still, or the video repeats its frames."
         )
     if read.plan.crop is not None:
         left = math.prod(read.plan.crop.size) / (clip.video["width"] * clip.video["height"])

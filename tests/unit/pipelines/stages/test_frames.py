@@ -476,3 +476,28 @@ def test_bars_and_logos_can_be_left(tmp_path: Path) -> None:
     assert (summary["width"], summary["warnings"]) == (640, [])
     assert not any("mask" in row for row in rows)
     assert not (out / "masks").exists()
+
+
+def test_frames_that_a_film_repeats_are_chosen_once(tmp_path: Path) -> None:
+    """A time lapse, or a recording of a slow stream, stored at many frames a second."""
+    marked_pictures(tmp_path / "p", 20, blurred=set())
+    clip = tmp_path / "a.mp4"
+    ffmpeg(
+        "-framerate", "2", "-i", tmp_path / "p" / "%04d.png", "-r", "30",
+        "-pix_fmt", "yuv420p", "-crf", "30", clip,
+    )  # fmt: skip
+    ingested(tmp_path, clip)
+    summary, rows, out = chosen(tmp_path, num_frames=60)
+    numbers = [number_in(out / row["file"]) for row in rows]
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) >= 19
+    (told,) = summary["warnings"]
+    assert "show what the one before shows" in told
+
+
+def test_a_small_thing_that_turns_before_a_still_camera_repeats_nothing(tmp_path: Path) -> None:
+    turn = "color=gray:s=320x180:r=30:d=3[g];testsrc2=s=48x48:r=30:d=3[t];[g][t]overlay=x=3*n:y=80"
+    ingested(tmp_path, make_clip(tmp_path / "a.mp4", turn))
+    summary, _, _ = chosen(tmp_path, num_frames=30)
+    assert summary["num_frames"] >= 30
+    assert summary["warnings"] == []
