@@ -168,7 +168,7 @@ def is_one_film(first: Sequence[Look | None], second: Sequence[Look | None]) -> 
 
 def _normal(look: Look) -> Look:
     """Without its mean, of length 1; all zeros where it is flat."""
-    plain = look - look.mean()
+    plain: NDArray[np.float32] = look - look.mean()
     length = float(np.sqrt((plain**2).sum()))
-    normal: Look = plain / length if length > 0 else plain
+    normal: NDArray[np.float32] = plain / np.float32(length if length > 0 else 1.0)
     return normal
