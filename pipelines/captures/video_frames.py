@@ -70,11 +70,12 @@ class Frame:
     def repeats(self, other: Frame) -> bool:
         """Whether nothing but noise of coding tells the frame from another one of its size.
 
-        Means of blocks are compared, without what they have in common: light may change.
+        Means of blocks are compared, without what they have in common: light may change. Where
+        the frame is like itself moved by a block, as a plain wall is, the camera may have moved.
         """
         one, two = (_block_means(frame.luma) for frame in (self, other))
-        apart = np.abs(one - two - np.median(one - two))
-        return bool(apart.max() <= _REPEAT_MOST and np.percentile(apart, 99) <= _REPEAT_MOSTLY)
+        moved = ((one[1:], one[:-1]), (one[:, 1:], one[:, :-1]))
+        return _alike(one, two) and not any(_alike(*pair) for pair in moved)
 
     def save(self, path: Path, quality: int) -> None:
         """Write as a baseline JPEG, 4:2:0, with no metadata."""
@@ -85,6 +86,14 @@ class Frame:
         ]
         picture = PIL.Image.merge("YCbCr", [PIL.Image.fromarray(self.luma), *full])
         picture.save(path, "JPEG", quality=quality, subsampling=2)
+
+
+def _alike(one: npt.NDArray[np.float32], two: npt.NDArray[np.float32]) -> bool:
+    """Whether means of blocks of one shape differ by noise only; where there are none they do."""
+    if not one.size:
+        return True
+    apart = np.abs(one - two - np.median(one - two))
+    return bool(apart.max() <= _REPEAT_MOST and np.percentile(apart, 99) <= _REPEAT_MOSTLY)
 
 
 def _block_means(luma: Plane) -> npt.NDArray[np.float32]:

@@ -501,3 +501,14 @@ def test_a_small_thing_that_turns_before_a_still_camera_repeats_nothing(tmp_path
     summary, _, _ = chosen(tmp_path, num_frames=30)
     assert summary["num_frames"] >= 30
     assert summary["warnings"] == []
+
+
+def test_a_camera_that_moves_before_a_plain_wall_repeats_nothing(tmp_path: Path) -> None:
+    """Light falls off along it, and that is all that is seen for a second of three."""
+    shades = "c0=0xb0b0b0:c1=0x909090:n=2:x0=0:y0=0:x1=320:y1=0:speed=0.00001"
+    wall = f"gradients={shades}:s=320x180:r=30:d=1[w]"
+    film = f"testsrc2=s=320x180:r=30:d=2,hue=H=t[m];{wall};[m][w]concat=n=2"
+    ingested(tmp_path, make_clip(tmp_path / "a.mp4", film))
+    summary, _, _ = chosen(tmp_path, num_frames=30)
+    assert summary["num_frames"] >= 30
+    assert summary["warnings"] == []
