@@ -5,7 +5,8 @@ To structure from motion it is a thing that flies along with the camera and matc
 other. It is told by its edges: whatever a hand-held camera shows, at no pixel do nine of ten
 pictures have the same gradient. Opaque parts without edges hang together with these and do not
 change; through others the scene shines. Straight edges alone are none of it: a camera that slides
-along a shelf keeps those, too.
+along a shelf keeps those, too. Nor is what the scene around hardly moves against: the thing that
+a gimbal or a drone keeps in the middle of its circle, and what is far ahead.
 
 Where much beside it stays as well, the camera stood still, or things stood before a plain ground:
 then nothing is told. The median gradient after Dekel et al., "On the effectiveness of visible
@@ -45,6 +46,11 @@ _LEAST_EDGE_PX = 40
 """Fewer pixels of edges in one part are chance."""
 _LEAST_ACROSS = 0.05
 """Of a part's gradients, those across their main direction: straight edges have none."""
+_LEAST_MOVED = 0.5
+"""Of how the whole picture changes from one to the next, for its texture: a ring around a part."""
+_RING_PX = (8, 13)
+_LEAST_TEXTURE = 1.0
+"""Levels of 255 per pixel; in a ring with less nothing can be seen to move."""
 _GAP_PX, _GROWN_PX = 3, 3
 """What lies between edges closer than twice this belongs to them; so does what is beside them."""
 _LARGEST_HOLE = 0.002
@@ -90,7 +96,7 @@ def find_burned_in(files: Sequence[Path], ctx: StageContext) -> BurnedIn | None:
     rows, columns = _bars(still | edges)
     inner = np.zeros_like(edges)
     inner[rows, columns] = True
-    laid = _laid_over(edges, toward, still) | ~inner
+    laid = _laid_over(edges, toward, still, _Motion.of(pictures)) | ~inner
     covered = laid & inner
     if (still & ~laid).sum() > _MOST_STILL * max((~laid).sum(), 1):
         return None
@@ -134,16 +140,47 @@ def _steady_edges(pictures: Floats) -> tuple[Bools, Floats]:
     return edges, toward
 
 
-def _laid_over(edges: Bools, toward: Floats, still: Bools) -> Bools:
-    """Parts with enough edges in more than one direction, and what stays beside them, [h, w]."""
+@dataclass(frozen=True)
+class _Motion:
+    """By how many levels pictures change from each to the next, in the median, and the gradient
+    that they have in the mean; [h, w]."""
+
+    change: Floats
+    texture: Floats
+
+    @classmethod
+    def of(cls, pictures: Floats) -> _Motion:
+        """Of pictures [N, h, w] in order."""
+        change = np.median(np.abs(np.diff(pictures, axis=0)), axis=0)
+        texture = np.zeros_like(pictures[0])
+        for picture in pictures:
+            texture += np.hypot(*np.gradient(picture))
+        return cls(change.astype(np.float32), texture / len(pictures))
+
+    def goes_past(self, part: Bools, stays: Bools) -> bool:
+        """Whether the scene around a part moves as it does elsewhere, beside all that stays."""
+        near, far = (ndimage.binary_dilation(part, iterations=reach) for reach in _RING_PX)
+        ring, away = far & ~near & ~stays, ~far & ~stays
+        if not ring.any() or not away.any() or self.texture[ring].mean() < _LEAST_TEXTURE:
+            return True
+        moved = self.change[ring].sum() / self.texture[ring].sum()
+        elsewhere = self.change[away].sum() / max(self.texture[away].sum(), 1e-6)
+        return bool(moved > _LEAST_MOVED * elsewhere)
+
+
+def _laid_over(edges: Bools, toward: Floats, still: Bools, motion: _Motion) -> Bools:
+    """Parts with enough edges in more than one direction that the scene goes past, and what stays
+    beside them, [h, w]."""
     near = ndimage.binary_dilation(edges, iterations=_GAP_PX)
     closed = ndimage.binary_erosion(near, iterations=_GAP_PX, border_value=1) | edges
     # Specks of what stays by chance hang together with nothing.
-    parts, _ = ndimage.label(closed | still, np.ones((3, 3)))
+    stays = closed | still
+    parts, _ = ndimage.label(stays, np.ones((3, 3)))
     kept = [
         part
         for part in np.unique(parts[edges])
         if _is_drawn(toward[:, edges & (parts == part)].astype(np.float64))
+        and motion.goes_past(parts == part, stays)
     ]
     laid = np.isin(parts, kept)
     holes, _ = ndimage.label(~laid)

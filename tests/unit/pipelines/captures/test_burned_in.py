@@ -17,6 +17,7 @@ from pipelines.captures.video_frames import Crop
 from pipelines.stage import StageContext
 from tests.unit.pipelines.captures.archives import nerfstudio_files
 from tests.unit.pipelines.captures.ingesting import cameras, ingest
+from tests.unit.pipelines.sfm.synthetic_room import arc_poses, render
 
 _WIDTH, _HEIGHT = 640, 360
 _DATE = (20, 320, 184, 350)
@@ -178,6 +179,24 @@ def test_what_is_no_overlay(
     tmp_path: Path, ctx: StageContext, lays: list[Lay], moving: bool
 ) -> None:
     assert find_burned_in(written(tmp_path / "p", *lays, moving=moving), ctx) is None
+
+
+def test_what_a_gimbal_keeps_in_the_middle_is_no_overlay(tmp_path: Path, ctx: StageContext) -> None:
+    """All pictures of a circle look at one point, and what is around it stays nearly in place."""
+    (tmp_path / "p").mkdir()
+    plain, dated = [], []
+    for number, pose in enumerate(arc_poses(24)):
+        plain.append(tmp_path / "p" / f"{number:02d}.jpg")
+        picture = PIL.Image.fromarray(np.asarray(render(pose)))
+        picture.save(plain[-1], quality=92)
+        dated.append(tmp_path / "p" / f"{number:02d}-dated.jpg")
+        picture = picture.resize((_WIDTH, _HEIGHT))
+        date(picture)
+        picture.save(dated[-1], quality=92)
+    assert find_burned_in(plain, ctx) is None
+    mask = found(dated, ctx).mask
+    assert mask[boxed(_DATE)].mean() > 0.95
+    assert not mask[:300].any()
 
 
 def test_a_frame_hides_what_it_covers_and_not_what_is_in_it(
