@@ -45,6 +45,12 @@ class StageOptions(BaseModel):
         """
         return base, given
 
+    @classmethod
+    def completed(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
+        """Options that a job was stored with, with what stood for those that came later where that
+        is not today's default. stored: complete when they were stored; not changed."""
+        return dict(stored)
+
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     """`base` with the nested keys of `over` laid on top; neither is changed."""

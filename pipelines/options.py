@@ -449,7 +449,7 @@ def revise_options(
     another `train.method` training begins with the preset's options. Raises as `resolve_options`.
     """
     kept = {
-        name: dict(values)
+        name: STAGE_OPTIONS.get(name, StageOptions).completed(values)
         for name, values in present.items()
         if name not in PRESETS[preset].without
     }
@@ -495,6 +495,6 @@ def _train_ground(
 
 def stage_options(stage: str, values: dict[str, Any]) -> StageOptions:
     """The checked options of one stage from plain values."""
-    if stage == "train":
-        return train_options(str(values.get("method", NERFACTO.name))).model_validate(values)
-    return STAGE_OPTIONS[stage].model_validate(values)
+    method = str(values.get("method", NERFACTO.name))
+    model = train_options(method) if stage == "train" else STAGE_OPTIONS[stage]
+    return model.model_validate(model.completed(values))

@@ -31,13 +31,13 @@ from pipelines.stage import StageContext
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
-_LEAST_PICTURES, _MOST_PICTURES = 12, 32
-"""Fewer have too much in common; more are not looked at."""
+_LEAST_PICTURES, _FEW, _MOST_PICTURES = 12, 24, 32
+"""Fewer have too much in common, few may have some; more are not looked at."""
 _LONG_SIDE_PX = 640
 """Pictures are looked at with this long side; what follows counts its pixels."""
 _LEAST_GRADIENT = 3.0
 """Levels of 255 per pixel that an edge has in the median picture."""
-_SAME, _SAME_BESIDE = 0.9, 0.7
+_SAME, _SAME_OF_FEW, _SAME_BESIDE = 0.9, 0.95, 0.7
 """Share of the pictures that have at least half of that edge; where such an edge goes on, less is
 enough, as where the scene shines through."""
 _MOST_CHANGE = 8.0
@@ -132,8 +132,9 @@ def _steady_edges(pictures: Floats) -> tuple[Bools, Floats]:
     size = np.hypot(*toward)
     along = (down * toward[0] + right * toward[1]) / np.maximum(size, 1e-3)
     same = (along > 0.5 * size).mean(axis=0)
+    wanted = _SAME_OF_FEW if len(pictures) < _FEW else _SAME
     edges: Bools = ndimage.binary_propagation(
-        (size > _LEAST_GRADIENT) & (same >= _SAME),
+        (size > _LEAST_GRADIENT) & (same >= wanted),
         structure=np.ones((3, 3)),
         mask=(size > _LEAST_GRADIENT) & (same >= _SAME_BESIDE),
     )

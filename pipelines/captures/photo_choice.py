@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import PIL.ExifTags
 import PIL.Image
 import PIL.ImageOps
 from numpy.typing import NDArray
@@ -74,6 +75,7 @@ _COPY_DIFFERENCE = 3.0
 """Mean difference in brightness, of 255, of reduced pictures that show the same. On real photos a
 copy at an eighth of the size comes to 0.7 to 2.8, by its filter; a view a hundredth of the picture
 aside to 6 and more."""
+_ORIENTATION = PIL.ExifTags.Base.Orientation
 _FIRST_ON_ITS_SIDE = 5
 """EXIF orientations from here on exchange width and height."""
 _SAME_TAKE = 0.9
@@ -181,8 +183,11 @@ class _Images:
         except DAMAGED:
             return None
 
-    def brightness(self, look: _Look, side_px: int) -> NDArray[np.float32] | None:
-        """The upright picture's brightness as a square, or None as `decoded`."""
+    def brightness(
+        self, look: _Look, side_px: int, shape: float | None = None
+    ) -> NDArray[np.float32] | None:
+        """Brightness of the upright picture, or of its middle of that shape (width by height),
+        squeezed to a square; None as `decoded`."""
         if look.num_pixels > self._max_pixels:
             return None
         try:
@@ -192,13 +197,19 @@ class _Images:
                 image.draft("RGB", (2 * side_px, 2 * side_px))
                 # A JPEG that was decoded smaller is padded: sides are rounded up.
                 scale = max(1, round(width / image.width))
+                exif = image.getexif()
+                if shape is not None and exif.get(_ORIENTATION, 1) >= _FIRST_ON_ITS_SIDE:
+                    shape = 1 / shape
+                across, down = _middle(width / height, shape)
+                right, below = min(width / scale, image.width), min(height / scale, image.height)
+                left, top = right * (1 - across) / 2, below * (1 - down) / 2
                 plain = image.convert("RGB" if image.mode == "P" else "L").convert("L")
                 square = plain.resize(
                     (side_px, side_px),
                     PIL.Image.Resampling.LANCZOS,
-                    box=(0, 0, min(width / scale, image.width), min(height / scale, image.height)),
+                    box=(left, top, right - left, below - top),
                 )
-                square.info["exif"] = image.getexif().tobytes()
+                square.info["exif"] = exif.tobytes()
                 return np.asarray(PIL.ImageOps.exif_transpose(square), np.float32)
         except DAMAGED:
             return None
@@ -233,10 +244,19 @@ def _is_one_take(look: _Look, best: _Look, images: _Images) -> bool:
     """
     if look.taken_at is not None and look.taken_at == best.taken_at:
         return True
-    seen = [images.brightness(item, _COMPARED_PX) for item in (look, best)]
+    # Cameras that are set to 16:9 or square develop the middle of what they keep as raw.
+    shape = best.width / best.height
+    seen = [images.brightness(item, _COMPARED_PX, shape) for item in (look, best)]
     if seen[0] is None or seen[1] is None:
         return True
     return _correlation(seen[0], seen[1]) >= _SAME_TAKE
+
+
+def _middle(own: float, wanted: float | None) -> tuple[float, float]:
+    """Of a picture's width and height the shares that its middle of another shape has."""
+    if wanted is None or max(own, wanted) <= (1 + _ASPECT_SLACK) * min(own, wanted):
+        return 1.0, 1.0
+    return min(1.0, wanted / own), min(1.0, own / wanted)
 
 
 def _correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:

@@ -136,7 +136,8 @@ class DecodePlan:
     the colour matrix to assume, or None for the one that the video names.
     step_s: at most one frame is delivered per cell of this length (from `start_s` on, on a clock
     that stands still in the `pauses`); 0 for all.
-    crop: the part of the upright, unreduced frames that is taken; None for all.
+    crop: the part of the upright, unreduced frames that is taken; None for all. whole: their size
+    with square pixels, which a crop is a part of.
     stream: as in `VideoInfo`.
     """
 
@@ -147,6 +148,7 @@ class DecodePlan:
     start_s: float = 0.0
     step_s: float = 0.0
     crop: Crop | None = None
+    whole: tuple[int, int] = (0, 0)
     stream: str = "0:V:0"
     pauses: Sequence[Pause] = ()
 
@@ -171,8 +173,12 @@ def filter_chain(plan: DecodePlan, pq_table: Path | None = None) -> str:
     if plan.matrix is not None:
         parts.append(f"setparams=colorspace={plan.matrix}")
     if plan.crop is not None:
+        # Shares of the stored frame, whose pixels need not be square.
         x, y, width, height = plan.crop
-        parts.append(f"crop={width}:{height}:{x}:{y}:exact=1")
+        across, down = plan.whole
+        parts.append(
+            f"crop=iw*{width}/{across}:ih*{height}/{down}:iw*{x}/{across}:ih*{y}/{down}:exact=1"
+        )
     parts.append(f"scale={plan.width}:{plan.height}:flags=bicubic+accurate_rnd")
     if plan.hdr in TRANSFERS:
         parts += sdr_filters(plan.hdr, pq_table)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
@@ -161,6 +162,11 @@ class MeshOptions(CropOptions, TextureOptions):
         "three.js and Babylon read it, with a transcoder to be switched on; other programs may not "
         "know it.",
     )
+
+    @classmethod
+    def completed(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
+        """Before `stl_unit` all files had the frame's own unit."""
+        return {"stl_unit": "frame", **stored} if "up_axis" in stored else dict(stored)
 
     def up_in(self, format: Format) -> Axis:
         """Which axis is up in the files of a format, where that is not the format's own matter."""

@@ -54,7 +54,7 @@ def _base(
     """What stands where the request says nothing."""
     defaults = model().model_dump(mode="json")
     try:
-        own = merge(defaults, dict(job_options))
+        own = merge(defaults, model.completed(job_options))
         return model.model_validate(own).model_dump(mode="json")
     except ValidationError:
         known = PRESETS[preset].overrides.get(kind, {}) if preset in PRESETS else {}

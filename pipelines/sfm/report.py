@@ -321,8 +321,9 @@ def mixed_lens_warnings(outcome: Outcome) -> list[dict[str, Any]]:
     return [
         {
             "code": "lenses_unsettled",
-            "message": "Nothing in the photos says through which lens they were taken; they "
-            f"{seem} of several, or zoomed, and could not be told apart{few}: poses may be wrong.",
+            "message": "Nothing in the photos, or in some of them, says through which lens they "
+            f"were taken; they {seem} of several, or zoomed, and could not be told apart{few}: "
+            "poses may be wrong.",
             "hint": "Send the originals with their EXIF, not copies from a messenger, or take all "
             "photos through one lens without zooming or cropping.",
             "details": {"agreement": None if agreed is None else round(agreed, 4)},

@@ -199,7 +199,12 @@ def unknown_lenses(source: Source, wanted: str) -> list[tuple[int, ...]]:
     if source.is_video or source.has_panoramas or wanted == "OPENCV_FISHEYE":
         return []
     groups = camera_groups(source, wanted)
-    return [tuple(group.indices) for group in groups if group.focal_px is None]
+    told = [bool(tags.get("focal_mm") or tags.get("focal_35mm")) for tags in source.exif]
+    return [
+        tuple(group.indices)
+        for group in groups
+        if group.focal_px is None and not (told and told[group.indices[0]])
+    ]
 
 
 def prior_focal_px(exif: Mapping[str, Any], width: int, height: int) -> float | None:

@@ -368,7 +368,8 @@ def _decode_clip(
         start_s=clip.start_s,
         step_s=_step(clip, share * options.candidates_per_frame),
         crop=crop,
-        stream=clip.video["stream"],
+        whole=(clip.video["width"], clip.video["height"]),
+        stream=clip.video.get("stream", "0:V:0"),
         pauses=clip.pauses,
     )
 

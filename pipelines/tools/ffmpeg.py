@@ -272,7 +272,10 @@ def _video_stream(lines: Sequence[str]) -> tuple[str, str, str]:
             code="no_video_stream",
             hint="Send a file with pictures in it; this one holds sound or data only.",
         )
-    specifier, start = max(found, key=lambda item: _num_pixels(lines[item[1]]))
+    # Phones keep a few large stills beside a film, as a stream of its own.
+    fastest = max(_rate(lines[number]) or 0.0 for _, number in found)
+    moving = [one for one in found if (_rate(lines[one[1]]) or 0.0) >= fastest / 4]
+    specifier, start = max(moving, key=lambda item: _num_pixels(lines[item[1]]))
     below = []
     for line in lines[start + 1 :]:
         if re.match(r"\s+Stream #|\s*Stream mapping|Output #|At least one output", line):

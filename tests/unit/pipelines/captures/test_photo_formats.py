@@ -28,6 +28,7 @@ from tests.unit.pipelines.captures.ingesting import (
     sources,
     warning_with,
 )
+from tests.unit.pipelines.captures.test_photo_choice import scene
 
 TOLERANCE = 4
 """Levels of 255, the mean over a smooth picture: what 4:2:0 at a high rate and JPEG lose."""
@@ -227,6 +228,25 @@ def test_raw_beside_the_photo_developed_from_it_is_taken_once(tmp_path: Path) ->
         files[f"IMG_{n}.dng"] = dng(smooth(n))
     summary, ctx = ingest(tmp_path, files)
     assert sources(ctx) == [f"IMG_{n}.JPG" for n in range(8)]
+    assert warning_with(summary, "8 pictures at the top", "the same photo lies there developed")
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+@pytest.mark.parametrize("shape", ["16:9", "1:1"])
+def test_raw_beside_a_photo_of_another_shape_is_taken_once(
+    tmp_path: Path, shape: str, orientation: int
+) -> None:
+    """A camera set to 16:9 or square; RAF and CR3 tell no time by which they could be told."""
+    files: Files = {}
+    for n in range(8):
+        whole = scene(n, (128, 192))
+        middle = whole[10:118] if shape == "16:9" else whole[:, 32:160]
+        files[f"DSCF{n:04d}.JPG"] = jpeg(np.rot90(middle, {1: 0, 6: 3}[orientation]))
+        files[f"DSCF{n:04d}.RAF"] = dng(whole, Dng(orientation=orientation))
+        files[f"DSCF{n + 50:04d}.JPG"] = jpeg(scene(n + 20, (128, 128)))
+        files[f"DSCF{n + 50:04d}.RAF"] = dng(scene(n + 40, (128, 192)))
+    summary, ctx = ingest(tmp_path, files)
+    assert len(sources(ctx)) == 24, "two cameras may number alike"
     assert warning_with(summary, "8 pictures at the top", "the same photo lies there developed")
 
 

@@ -8,7 +8,13 @@ from pipelines.exports.mesh_options import Format, MeshOptions
 from pipelines.exports.options import RenderingOptions, render_config
 from pipelines.exports.requests import resolve_export
 from pipelines.nerf.options.render import RenderConfig
-from pipelines.options import OptionsError, evaluate_config, resolve_options, stage_options
+from pipelines.options import (
+    OptionsError,
+    evaluate_config,
+    resolve_options,
+    revise_options,
+    stage_options,
+)
 
 RENDERING_STAGES = ("video", "mesh", "pointcloud")
 
@@ -125,3 +131,16 @@ def test_a_stored_jobs_axis_stays_what_it_was(stored: str) -> None:
     assert resolve_export("mesh", "preview", own, {"formats": ["obj"]})["up_axis"] == stored
     again = resolve_export("mesh", "preview", own, {"up_axis": "auto"})
     assert again["up_axis"] == "auto"
+
+
+def test_a_stored_jobs_stl_stays_as_large_as_it_was() -> None:
+    """Jobs from before `stl_unit` have none; their files had the frame's own unit."""
+    own = {**resolve_options("preview", {})["mesh"]}
+    assert own.pop("stl_unit") == "millimetre"
+    assert resolve_export("mesh", "preview", own, {"formats": ["stl"]})["stl_unit"] == "frame"
+    asked = resolve_export("mesh", "preview", own, {"stl_unit": "millimetre"})
+    assert asked["stl_unit"] == "millimetre"
+    assert stage_options("mesh", own).model_dump()["stl_unit"] == "frame"
+    whole = {**resolve_options("preview", {}), "mesh": own}
+    again = revise_options("preview", whole, {"pointcloud": {"formats": ["las"]}})
+    assert again["mesh"]["stl_unit"] == "frame"

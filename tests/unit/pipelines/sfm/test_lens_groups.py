@@ -225,6 +225,8 @@ def test_lenses_are_unknown_of_photos_whose_exif_is_silent(tmp_path: Path) -> No
     assert unknown_lenses(replace(photos, is_video=True), "SIMPLE_RADIAL") == []
     told = replace(photos, exif=({"focal_35mm": 26.0}, {}, {"focal_35mm": 26.0}))
     assert unknown_lenses(told, "SIMPLE_RADIAL") == [(1,)]
+    millimetres = replace(photos, exif=({"focal_mm": 20.0}, {}, {"focal_mm": 20.0}))
+    assert unknown_lenses(millimetres, "SIMPLE_RADIAL") == [(1,)], "of which sensor nobody knows"
 
 
 def test_photos_of_two_zooms_have_two_cameras_and_true_poses(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -466,6 +467,36 @@ def test_bars_are_cut_away_and_a_logo_is_masked(tmp_path: Path) -> None:
             hidden = np.asarray(mask) < 128
         assert hidden[121:159, left + 21 : left + 59].all()
         assert hidden.mean() < 0.06
+
+
+@pytest.mark.parametrize("aspect", ["64/45", "8/9"])
+def test_bars_are_cut_off_where_pixels_are_not_square(tmp_path: Path, aspect: str) -> None:
+    """DV, HDV and DVDs: the film is shown wider or narrower than it is stored."""
+    plain, framed = panned(tmp_path, (0.4, 0.4)), tmp_path / "framed.mp4"
+    ffmpeg(
+        "-i", plain, "-vf", f"pad=400:180:40:0,setsar={aspect}", "-pix_fmt", "yuv420p", framed,
+    )  # fmt: skip
+    ingested(tmp_path, framed)
+    summary, rows, out = chosen(tmp_path, num_frames=16)
+    (read,) = json.loads((out / "frames.json").read_text())["clips"]
+    stretch = float(Fraction(aspect))
+    assert read["crop"] == pytest.approx([40 * stretch, 0, 320 * stretch, 180], abs=6)
+    assert [warning.split()[0] for warning in summary["warnings"]] == ["Bars"]
+    with PIL.Image.open(out / rows[0]["file"]) as image:
+        pixels = np.asarray(image.convert("L"))
+    assert pixels[:, 0].mean() > 40
+    assert pixels[:, -1].mean() > 40
+
+
+def test_a_capture_that_an_earlier_version_took_in_has_its_first_stream(tmp_path: Path) -> None:
+    ingested(tmp_path, make_clip(tmp_path / "a.mp4"))
+    record = tmp_path / "job" / "ingest" / "capture.json"
+    taken = json.loads(record.read_text())
+    for clip in taken["clips"]:
+        del clip["video"]["stream"], clip["pauses"]
+    record.write_text(json.dumps(taken))
+    summary, _, _ = chosen(tmp_path)
+    assert summary["num_frames"] > 8
 
 
 def test_bars_and_logos_can_be_left(tmp_path: Path) -> None:

@@ -87,6 +87,16 @@ def test_the_film_is_the_largest_stream_not_a_preview_before_it(tmp_path: Path) 
     assert probe(both).stream == "0:0"  # of several as large the first
 
 
+def test_a_few_large_stills_beside_a_film_are_not_the_film(tmp_path: Path) -> None:
+    """Phones keep such with a moving photo."""
+    film = make_clip(tmp_path / "film.mp4", "testsrc2=s=320x180:r=30:d=2")
+    stills = make_clip(tmp_path / "stills.mp4", "testsrc=s=640x480:r=3:d=1")
+    both = tmp_path / "both.mp4"
+    ffmpeg("-i", film, "-i", stills, "-map", "0:v", "-map", "1:v", "-c", "copy", both)
+    info = probe(both)
+    assert (info.width, info.height, info.stream) == (320, 180, "0:0")
+
+
 def test_a_larger_cover_picture_is_not_the_film() -> None:
     large = PHONE_9.replace("100x100", "3000x3000")
     info = parse_probe("mov", large.splitlines())
