@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(
             f"nerfworks runs at {embedded.url} (documentation: {embedded.url}/docs)\n"
             f"API key: {embedded.secrets.api_key}\n"
-            "Send a capture: .venv/bin/nerfworks submit VIDEO --wait --download out\n"
+            "Send a capture: .venv/bin/nerfworks submit VIDEO --wait --download out/VIDEO\n"
             "Ctrl-C stops it; jobs go on where they were when it is started again.",
             flush=True,
         )

@@ -199,6 +199,14 @@ class S3ObjectStore:
                 raise ObjectStoreError(f"Bucket {self._bucket} cannot be used.") from error
 
 
+def _region(settings: StorageSettings) -> str:
+    """Where the bucket is: as said here; else, of Amazon's, as its own tools know it."""
+    usual = None
+    if not settings.s3_endpoint_url:
+        usual = os.environ.get("AWS_REGION") or boto3.session.Session().region_name
+    return settings.s3_region or usual or "us-east-1"
+
+
 def _make_client(
     settings: StorageSettings,
     endpoint: str,
@@ -210,7 +218,7 @@ def _make_client(
     return boto3.client(
         "s3",
         endpoint_url=endpoint or None,
-        region_name=settings.s3_region,
+        region_name=_region(settings),
         aws_access_key_id=settings.s3_access_key_id.get_secret_value() or None,
         aws_secret_access_key=settings.s3_secret_access_key.get_secret_value() or None,
         config=Config(

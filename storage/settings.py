@@ -37,7 +37,9 @@ class StorageSettings(BaseSettings):
     s3_public_endpoint_url: str = Field(
         "", description="S3 endpoint as clients reach it, for presigned URLs; empty for the same."
     )
-    s3_region: str = Field("us-east-1", description="S3 region.")
+    s3_region: str = Field(
+        "", description="S3 region; empty for AWS's own settings, us-east-1 without or elsewhere."
+    )
     s3_access_key_id: SecretStr = Field(SecretStr(""), description="Empty for the AWS defaults.")
     s3_secret_access_key: SecretStr = Field(SecretStr(""), description="Goes with the key id.")
     s3_timeout_s: float = Field(

@@ -165,8 +165,12 @@ class MeshOptions(CropOptions, TextureOptions):
 
     @classmethod
     def completed(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
-        """Before `stl_unit` all files had the frame's own unit."""
-        return {"stl_unit": "frame", **stored} if "up_axis" in stored else dict(stored)
+        """Before `stl_unit` all files had the frame's own unit, and a mesh could be asked for with
+        fewer triangles than it takes now."""
+        known = {"stl_unit": "frame", **stored} if "up_axis" in stored else dict(stored)
+        if 0 < known.get("triangles", 0) < LEAST_TRIANGLES:
+            known["triangles"] = LEAST_TRIANGLES
+        return known
 
     def up_in(self, format: Format) -> Axis:
         """Which axis is up in the files of a format, where that is not the format's own matter."""

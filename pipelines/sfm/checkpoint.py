@@ -31,7 +31,9 @@ class Checkpoint:
             include={"max_image_px", "num_features", "upsample", "camera_model", "matcher"}
             | {"sequential_overlap", "retrieval_neighbours"}
         )
-        text = json.dumps([_FORMAT, inputs, wanted, ctx.seed], sort_keys=True)
+        masks = [(i, path.stat().st_size) for i, path in sorted(source.mask_paths.items())]
+        told = [_FORMAT, inputs, wanted, ctx.seed, *([masks] if masks else [])]
+        text = json.dumps(told, sort_keys=True)
         self._fingerprint = hashlib.sha256(text.encode()).hexdigest()
         self._steps: list[str] = []
         ctx.checkpoint.mkdir(parents=True, exist_ok=True)

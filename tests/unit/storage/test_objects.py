@@ -154,6 +154,42 @@ def test_a_signed_url_allows_one_object_for_a_time(store: LocalObjectStore) -> N
         verify_object_token(b"another key", token)
 
 
+def test_a_url_of_a_later_version_that_says_more_is_good() -> None:
+    payload = json.dumps(["jobs/a/x", "x", "model/x", 2**40, "0" * 64, "more"]).encode()
+    mac = hmac.digest(KEY, b"nerfworks object url\0" + payload, "sha256")
+    token = ".".join(base64.urlsafe_b64encode(part).decode().rstrip("=") for part in (payload, mac))
+    assert verify_object_token(KEY, token).key == "jobs/a/x"
+
+
+@pytest.mark.parametrize(
+    ("settings", "environment", "region"),
+    [
+        ({}, {}, "us-east-1"),
+        ({}, {"AWS_REGION": "eu-central-1"}, "eu-central-1"),
+        ({}, {"AWS_DEFAULT_REGION": "eu-west-3"}, "eu-west-3"),
+        ({"s3_region": "ap-south-1"}, {"AWS_REGION": "eu-central-1"}, "ap-south-1"),
+        ({"s3_endpoint_url": "http://own:9"}, {"AWS_REGION": "eu-central-1"}, "us-east-1"),
+    ],
+)
+def test_a_bucket_is_where_the_settings_or_amazons_own_say(
+    monkeypatch: pytest.MonkeyPatch,
+    settings: dict[str, str],
+    environment: dict[str, str],
+    region: str,
+) -> None:
+    for name in ("AWS_REGION", "AWS_DEFAULT_REGION", "AWS_PROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_CONFIG_FILE", os.devnull)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    keys = {"s3_access_key_id": "id", "s3_secret_access_key": "secret"}
+    store = open_object_store(
+        StorageSettings.model_validate({"objects_url": "s3://bucket", **keys, **settings})
+    )
+    url = store.signed_url("a", expires_s=60, filename="a", media_type="model/x")
+    assert f"%2F{region}%2Fs3%2F" in url
+
+
 def test_a_url_of_before_there_were_digests_in_it_is_good_until_it_expires() -> None:
     payload = json.dumps(["jobs/a/x", "x", "model/x", 2**40]).encode()
     mac = hmac.digest(KEY, b"nerfworks object url\0" + payload, "sha256")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.exports.mesh_options import Format, MeshOptions
+from pipelines.exports.mesh_options import LEAST_TRIANGLES, Format, MeshOptions
 from pipelines.exports.options import RenderingOptions, render_config
 from pipelines.exports.requests import resolve_export
 from pipelines.nerf.options.render import RenderConfig
@@ -144,3 +144,14 @@ def test_a_stored_jobs_stl_stays_as_large_as_it_was() -> None:
     whole = {**resolve_options("preview", {}), "mesh": own}
     again = revise_options("preview", whole, {"pointcloud": {"formats": ["las"]}})
     assert again["mesh"]["stl_unit"] == "frame"
+
+
+def test_a_stored_job_of_fewer_triangles_than_it_takes_now_goes_on() -> None:
+    own = {**resolve_options("preview", {})["mesh"], "triangles": 10, "extent": "subject"}
+    assert stage_options("mesh", own).model_dump()["triangles"] == LEAST_TRIANGLES
+    asked = resolve_export("mesh", "preview", own, {"formats": ["stl"]})
+    assert (asked["triangles"], asked["extent"]) == (LEAST_TRIANGLES, "subject")
+    whole = {**resolve_options("preview", {}), "mesh": own}
+    assert revise_options("preview", whole, {})["mesh"]["triangles"] == LEAST_TRIANGLES
+    with pytest.raises(OptionsError, match="10 triangles"):
+        resolve_export("mesh", "preview", own, {"triangles": 10})

@@ -138,6 +138,21 @@ def climb(
     return Ladder(reconstructor, checkpoint, source, options, ctx, BY_KEYS).climb(), fractions
 
 
+def test_features_found_without_masks_are_not_those_of_masked_frames(tmp_path: Path) -> None:
+    """A film whose overlay an earlier version had not found has the same frames, and now masks."""
+    save_video_frames(tmp_path, [render(pose) for pose in arc_poses(3)])
+    workspace = Workspace(tmp_path)
+    ctx = StageContext("poses", workspace, tmp_path, workspace.checkpoint("poses"))
+    source = read_source(workspace)
+    first = Checkpoint(ctx, source, OPTIONS)
+    first.database("colmap").touch()
+    first.save("colmap features")
+    assert Checkpoint(ctx, source, OPTIONS).has("colmap features")
+    (source.root / "hidden.png").write_bytes(b"mask")
+    masked = replace(source, masks=("hidden.png", None, None))
+    assert not Checkpoint(ctx, masked, OPTIONS).has("colmap features")
+
+
 def test_frames_between_key_frames_lie_where_they_were_taken(tmp_path: Path) -> None:
     truth = arc_poses(24)
     pictures = [render(pose) for pose in truth]
