@@ -95,7 +95,7 @@ class FramesOptions(StageOptions):
     )
     jpeg_quality: int = Field(95, ge=50, le=100, description="JPEG quality of the frames kept.")
     find_burned_in: bool = Field(
-        True, description="Cut bars off films, and ignore dates and logos that lie over all frames."
+        True, description="Cut off bars, ignore dates and logos, and cut out what alone turns."
     )
 
 

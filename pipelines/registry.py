@@ -45,7 +45,7 @@ _EXPLAINS = "pipelines.stages.check:write_failed_check"
 STAGES: tuple[Stage, ...] = (
     Stage(
         name="ingest",
-        version=18,
+        version=19,
         after=(),
         reads=(),
         run="pipelines.stages.ingest:run",
@@ -55,7 +55,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="frames",
-        version=8,
+        version=9,
         after=("ingest",),
         reads=("ingest",),
         run="pipelines.stages.frames:run",

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipelines.captures.pictures import evenly_picked
+from pipelines.captures.small_pictures import load_small
 from pipelines.captures.video_frames import Crop
 from pipelines.stage import StageContext
 
@@ -87,7 +88,10 @@ def find_burned_in(files: Sequence[Path], ctx: StageContext) -> BurnedIn | None:
     """
     if len(files) < _LEAST_PICTURES:
         return None
-    pictures, size = _load([files[i] for i in evenly_picked(len(files), _MOST_PICTURES)], ctx)
+    picked = [files[i] for i in evenly_picked(len(files), _MOST_PICTURES)]
+    pictures = load_small(picked, _LONG_SIDE_PX, "L", ctx).astype(np.float32)
+    with PIL.Image.open(picked[0]) as opened:
+        size = opened.size
     edges, toward = _steady_edges(pictures)
     if edges.sum() < _LEAST_EDGE_PX:
         return None
@@ -105,22 +109,6 @@ def find_burned_in(files: Sequence[Path], ctx: StageContext) -> BurnedIn | None:
     if covered.sum() > _MOST_COVERED * inner.sum():
         return None
     return BurnedIn(_enlarged(laid, size), _crop(rows, columns, edges.shape, size))
-
-
-def _load(files: Sequence[Path], ctx: StageContext) -> tuple[Floats, tuple[int, int]]:
-    """Grey pictures [N, h, w], 0..255, and the size (W, H) that they had."""
-    loaded = []
-    size = (0, 0)
-    for file in files:
-        ctx.check_cancelled()
-        with PIL.Image.open(file) as opened:
-            size = opened.size
-            scale = min(1.0, _LONG_SIDE_PX / max(size))
-            small = (max(1, round(size[0] * scale)), max(1, round(size[1] * scale)))
-            opened.draft("L", small)  # a JPEG is then decoded no finer than it is needed
-            grey = opened.convert("L").resize(small, PIL.Image.Resampling.BOX)
-        loaded.append(np.asarray(grey, np.float32))
-    return np.stack(loaded), size
 
 
 def _steady_edges(pictures: Floats) -> tuple[Bools, Floats]:

@@ -13,9 +13,10 @@ from pipelines.captures.minimum import MIN_IMAGES
 from pipelines.captures.panorama_files import EQUIRECTANGULAR, FOLDER, write_views
 from pipelines.captures.photo_choice import choose_photos
 from pipelines.captures.photo_masks import PhotoMasks, find_masks
-from pipelines.captures.pictures import Picture, PictureWriter
+from pipelines.captures.pictures import JPEG_QUALITY, Picture, PictureWriter
 from pipelines.captures.record import Found
 from pipelines.captures.storing import store_each
+from pipelines.captures.turntable import TURNTABLE_NOTE, cut_turntable
 from pipelines.captures.unpack import CaptureArchive
 from pipelines.errors import CaptureError
 from pipelines.options import IngestOptions
@@ -47,6 +48,10 @@ def write_photos(
         upright=True,
         minimum=MIN_IMAGES,
     )
+    cuts = {}
+    if not any(one.mask or one.cut or one.views for one in pictures):
+        cuts = cut_turntable(ctx.out, [one.file for one in pictures], JPEG_QUALITY, ctx)
+    pictures = [replace(one, cut=cuts.get(one.file, one.cut)) for one in pictures]
     plain = [one for one in pictures if not (one.mask or one.cut or one.views)]
     common = mask_common_parts(ctx.out, plain, ctx)
     pictures = [replace(one, mask=common.masks.get(one.file, one.mask)) for one in pictures]
@@ -58,8 +63,9 @@ def write_photos(
             "largest": list(max(sizes)),
             **masks.details(),
             **common.details(),
+            **({"num_turned": len(cuts)} if cuts else {}),
         },
-        warnings=warnings + common.warnings(),
+        warnings=warnings + common.warnings() + ([TURNTABLE_NOTE] if cuts else []),
     )
 
 

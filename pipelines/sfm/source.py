@@ -115,7 +115,7 @@ def read_source(workspace: Workspace) -> Source:
         files = tuple(str(frame["file"]) for frame in frames)
         times = tuple(_seconds(frame["timestamp_s"]) for frame in frames)
         clips = tuple(int(frame.get("clip", 0)) for frame in frames)
-        masks = tuple(frame.get("mask") for frame in frames)
+        masks, cuts = (tuple(frame.get(what) for frame in frames) for what in ("mask", "cut"))
         source = Source(
             root,
             files,
@@ -125,6 +125,7 @@ def read_source(workspace: Workspace) -> Source:
             views=_views(frames),
             clip_names=names,
             masks=masks if any(masks) else (),
+            cuts=cuts if any(cuts) else (),
         )
     else:
         capture = json.loads((root / "capture.json").read_text("utf-8"))

@@ -38,6 +38,7 @@ from pipelines.captures.panorama_files import FOLDER as PANORAMAS
 from pipelines.captures.panorama_files import write_views
 from pipelines.captures.pauses import Pause, without_pauses
 from pipelines.captures.record import CaptureRecord
+from pipelines.captures.turntable import TURNTABLE_NOTE, cut_turntable
 from pipelines.captures.video_frames import (
     Crop,
     DecodePlan,
@@ -297,6 +298,7 @@ class _Read:
     num_kept: int
     num_repeated: int
     burned_in: float = 0.0
+    turned: bool = False
 
 
 def _read_clip(
@@ -314,6 +316,12 @@ def _read_clip(
     if not options.find_burned_in or clip.num_views:
         return read
     ctx, plan, own = scale.ctx, read.plan, rows[num_before:]
+    cuts = cut_turntable(ctx.out, [row["file"] for row in own], options.jpeg_quality, ctx)
+    for row in own:
+        if row["file"] in cuts:
+            row["cut"] = cuts[row["file"]]
+    if cuts:
+        return replace(read, turned=True)
     found = find_burned_in([ctx.out / row["file"] for row in own], ctx)
     if found is None:
         return read
@@ -436,6 +444,8 @@ def _warnings(clip: Clip, read: _Read, where: str) -> list[str]:
         warnings.append(
             f"Bars beside the pictures{where}, {1 - left:.0%} of the frame, were cut away."
         )
+    if read.turned:
+        warnings.append(f"In the video{where}: {TURNTABLE_NOTE}" if where else TURNTABLE_NOTE)
     if read.burned_in:
         warnings.append(burned_in_warning(read.burned_in, where))
     return warnings

@@ -20,6 +20,7 @@ from pipelines.options import FramesOptions, IngestOptions
 from pipelines.stage import StageContext
 from pipelines.stages import frames, ingest
 from pipelines.workspace import Workspace
+from tests.unit.pipelines.captures import made_turntable
 from tests.unit.pipelines.tools.clips import (
     ffmpeg,
     make_clip,
@@ -543,3 +544,22 @@ def test_a_camera_that_moves_before_a_plain_wall_repeats_nothing(tmp_path: Path)
     summary, _, _ = chosen(tmp_path, num_frames=30)
     assert summary["num_frames"] >= 30
     assert summary["warnings"] == []
+
+
+def test_a_thing_on_a_turntable_is_cut_out_of_the_room_behind_it(tmp_path: Path) -> None:
+    (tmp_path / "p").mkdir()
+    for number, picture in enumerate(made_turntable.made()[0]):
+        PIL.Image.fromarray(picture).save(tmp_path / "p" / f"{number:02d}.png")
+    clip = tmp_path / "a.mp4"
+    shown = ("-framerate", "6", "-i", tmp_path / "p" / "%02d.png", "-crf", "14")
+    ffmpeg(*shown, "-pix_fmt", "yuv420p", clip)
+    ingested(tmp_path, clip)
+    summary, rows, out = chosen(tmp_path, num_frames=60)
+    (told,) = summary["warnings"]
+    assert "a thing turned before it" in told
+    for row, thing in zip(rows, made_turntable.made()[1], strict=True):
+        with PIL.Image.open(out / row["cut"]) as cut, PIL.Image.open(out / row["file"]) as image:
+            left, picture = np.asarray(cut) > 0, np.asarray(image)
+        assert (left & thing).sum() > 0.85 * thing.sum()
+        assert (left & ~thing).sum() < 0.05 * thing.sum()
+        assert np.median(picture[~left].min(axis=1)) >= 250
