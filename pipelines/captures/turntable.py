@@ -55,10 +55,12 @@ _LEAST_STILL = 0.25
 _LEAST_STILL_BORDER = 0.6
 _DETAIL = 4.0
 """Levels a pixel, of a ground's gradient where it has details."""
-_LEAST_DETAIL = 0.03
+_LEAST_DETAIL = 0.08
 """Share of what stands still that has some."""
 _THING = (0.01, 0.6)
 """Share of the picture that the thing has, in nine pictures of ten."""
+_MOST_OF_BOX = 0.9
+"""Of its box; what fills that, in half of the pictures, is a window, as a recorded screen has."""
 _CHANGED = 20.0
 _LEAST_CHANGED = 0.15
 """Share of the thing that changes by more than that from one picture to the next, of those looked
@@ -112,6 +114,8 @@ def find_ground(files: Sequence[Path], ctx: StageContext) -> Ground | None:
     things = [ground.thing(picture) for picture in pictures]
     shares = np.array([thing.mean() for thing in things])
     if ((shares < _THING[0]) | (shares > _THING[1])).mean() > 0.1:
+        return None
+    if np.median([_share_of_box(thing) for thing in things]) > _MOST_OF_BOX:
         return None
     changed = [
         _changed(levelled[i], levelled[i + 1], things[i] & things[i + 1])
@@ -225,6 +229,14 @@ def _stands_still(always: Bools, level: Floats) -> bool:
     inside = ndimage.binary_erosion(always, iterations=2)
     gradient = np.hypot(*np.gradient(level.mean(axis=2)))
     return bool((gradient[inside] > _DETAIL).mean() >= _LEAST_DETAIL) if inside.any() else False
+
+
+def _share_of_box(thing: Bools) -> float:
+    """Of the smallest box around a thing, the share that it has."""
+    rows, columns = np.flatnonzero(thing.any(axis=1)), np.flatnonzero(thing.any(axis=0))
+    if not len(rows):
+        return 0.0
+    return float(thing[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].mean())
 
 
 def _changed(one: Colors, two: Colors, where: Bools) -> float:

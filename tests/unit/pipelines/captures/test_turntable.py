@@ -88,10 +88,19 @@ def somebody_walks_by(number: int) -> Picture:
     return picture
 
 
+def a_recorded_screen(number: int) -> Picture:
+    """A scanner's window, and around it buttons and a picture of what it is."""
+    picture = made()[0][0].copy()
+    view = np.asarray(synthetic_room.render(synthetic_room.arc_poses(NUM)[number]))
+    picture[50:260, 70:370] = view[50:260, 70:370]
+    return picture
+
+
 @pytest.mark.parametrize(
     "shown",
     [
         before_a_plain_ground,
+        a_recorded_screen,
         a_hand_that_holds_the_camera,
         a_walk,
         nothing_moves,
