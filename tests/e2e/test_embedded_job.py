@@ -28,7 +28,6 @@ pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 BRIEF = {
     **PLAIN,
     "frames": {"num_frames": 32},
-    "train": {"max_steps": 150},
     "pointcloud": {"num_points": 5000, "far_distance": 2.0},
 }
 
