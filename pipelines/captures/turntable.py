@@ -72,7 +72,7 @@ _LEAST_PIECE = 0.05
 
 @dataclass(frozen=True)
 class Ground:
-    """What stands still around a thing. level: [h, w, 3]. known: [h, w]. size: (w, h)."""
+    """What stands still around a thing. level: [h, w, 3], its colour. known: [h, w]."""
 
     level: Floats
     known: Bools
@@ -190,9 +190,9 @@ def _levelled(pictures: Colors) -> Colors:
 def _gain(picture: Colors, usual: Floats) -> Floats:
     """By how much a picture is brighter than usual at its border, for each channel."""
     rim = max(1, round(_BORDER * min(picture.shape[:2])))
-    inner = np.ones(picture.shape[:2], np.bool_)
-    inner[rim:-rim, rim:-rim] = False
-    bright = inner & (usual.min(axis=2) > 16) & (usual.max(axis=2) < 240)
+    at_border = np.ones(picture.shape[:2], np.bool_)
+    at_border[rim:-rim, rim:-rim] = False
+    bright = at_border & (usual.min(axis=2) > 16) & (usual.max(axis=2) < 240)
     if bright.sum() < 16:
         return np.ones(3, np.float32)
     gain: Floats = np.median(picture[bright] / usual[bright], axis=0).astype(np.float32)
