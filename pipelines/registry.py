@@ -65,7 +65,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
-        version=22,
+        version=23,
         after=("frames",),
         reads=("ingest", "frames"),
         run="pipelines.stages.poses:run",

@@ -13,6 +13,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from pipelines.options import PosesOptions
 from pipelines.scene.panoramas import MODEL as PANORAMA
@@ -23,7 +24,7 @@ from pipelines.sfm.agreement import (
     contradicted_images,
 )
 from pipelines.sfm.checkpoint import Checkpoint
-from pipelines.sfm.intrinsics import AUTO, FISHEYE, mapping_lens
+from pipelines.sfm.intrinsics import AUTO, FISHEYE, lens_ran_away, mapping_lens
 from pipelines.sfm.key_frames import (
     clips_of_keys,
     first_keys,
@@ -68,7 +69,7 @@ from pipelines.tools.colmap_results import (
     best_model,
     without_images,
 )
-from pipelines.tools.colmap_settings import FeatureSettings, extraction_threads
+from pipelines.tools.colmap_settings import FeatureSettings, MapperSettings, extraction_threads
 
 NUM_PROBES = 5
 """Images, spread over the capture, whose features are counted before the rest."""
@@ -367,7 +368,7 @@ class Ladder:
         counted = (len(keys), "placing key frame") if keys else (num, "placing image")
         watch = self._progress.watch((span[0], mapped), *counted)
 
-        def mapped_by(lenses: Lenses) -> Mapping:
+        def mapped_by(lenses: Lenses, settings: MapperSettings = settings) -> Mapping:
             return mended(
                 self._reconstructor.with_cameras(lenses) if lenses else self._reconstructor,
                 lambda reconstructor: reconstructor.map(settings, watch, keys),
@@ -378,6 +379,13 @@ class Ladder:
             )
 
         mapping = mapped_by(self._lenses)
+        if lens_ran_away(mapping.models, len(keys) or num):
+            self._ctx.logger.info("the distortion ran away: mapping without any")
+            unbent = replace(settings, refine_distortion=False)
+            held = mapped_by(self._lenses, unbent)
+            if held.num_placed > mapping.num_placed:
+                mapping, settings = held, unbent
+                mapped_by = partial(mapped_by, settings=unbent)
         settled: Settled = "known"
         alike = unknown_lenses(self._source, self._options.camera_model)
         if alike:

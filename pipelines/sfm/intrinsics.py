@@ -41,8 +41,9 @@ Floats = npt.NDArray[np.float64]
 AUTO = "auto"
 FISHEYE = "OPENCV_FISHEYE"
 LENSES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
-"""Tried in this order; each must earn its place over the best before it. OPENCV is the first with
-two focal lengths. A fisheye is another kind of lens, and known before mapping."""
+"""Tried in this order; each must earn its place over the best before it. Mapping starts with the
+first, or with none of them where it held the distortion. OPENCV is the first with two focal
+lengths. A fisheye is another kind of lens, and known before mapping."""
 MIN_GAIN = 0.005
 BENT_GAIN = 0.02
 MAX_MOVE = 0.01
@@ -54,6 +55,11 @@ MIN_HELD_OUT = 60
 WEAK_PERCENT = 10.0
 """Uncertainty of the focal length from which it is called weak: well filmed captures have 1 to 2,
 one whose rays differ by 6 degrees 4 to 5 (docs/poses-experiments.md)."""
+
+_MOST_BENT = 1.0
+"""Distortion from which COLMAP takes images out of a model."""
+_FEW_PLACED = 0.8
+"""Share of the images below which a model lacks many."""
 
 _CAP = 5.0
 """Errors count up to so many medians: a wrong match says nothing of the lens."""
@@ -137,6 +143,17 @@ def mapping_lens(wanted: str) -> str:
     return LENSES[0] if wanted == AUTO else wanted
 
 
+def lens_ran_away(models: Sequence[SparseModel], num_images: int) -> bool:
+    """Whether models of so many images hold few of them, as a lens bends beyond what any does.
+
+    What is flat and far says next to nothing of focal length and distortion: both grow until COLMAP
+    takes the images out again. A model without distortion holds them all.
+    """
+    held = max((len(model.indices) for model in models), default=0)
+    is_bent = any(abs(camera.k1) > _MOST_BENT for model in models for camera in model.cameras)
+    return held < _FEW_PLACED * num_images and (is_bent or not models)
+
+
 def unsettled(model: SparseModel) -> tuple[LensVerdict, ...]:
     """What is said of the lenses of a model with panoramas, which are left as they were mapped."""
     counts = [model.camera_of.count(camera) for camera in range(len(model.cameras))]
@@ -169,11 +186,11 @@ def settle_lenses(
     """
     fits = [trials.fit(trials.cameras)]
     if wanted == AUTO:
-        for lens in LENSES[1:]:
+        for lens in LENSES:
             changed = {
                 i: lens
                 for i, views in trials.num_views.items()
-                if views >= MIN_VIEWS and trials.cameras[i] != FISHEYE
+                if views >= MIN_VIEWS and trials.cameras[i] not in (FISHEYE, lens)
             }
             if changed:
                 fits.append(trials.fit(trials.cameras | changed))
@@ -350,7 +367,7 @@ def _why(wanted: str, candidates: Sequence[Candidate], lens: str, num_held_out: 
         return "too few points are seen by four images to compare lenses"
     if len(candidates) == 1:
         return f"fewer than {MIN_VIEWS} images: more terms would fit noise"
-    if lens == LENSES[0]:
+    if lens == candidates[0].lens:
         return "nothing richer lowers the held-out error enough"
     taken = next(candidate for candidate in candidates if candidate.lens == lens)
     return (

@@ -33,7 +33,7 @@ from PIL import Image
 
 from pipelines.errors import ToolError
 from pipelines.tools.colmap_adjustment import Run
-from pipelines.tools.colmap_lenses import LensTrials
+from pipelines.tools.colmap_lenses import LensTrials, name_unbent
 from pipelines.tools.colmap_placing import num_tidying_steps, place_others
 from pipelines.tools.colmap_probing import (
     MatchedPairs,
@@ -68,6 +68,10 @@ Watch = Callable[[int], None]
 
 _POLL_S = 0.5
 _IMAGE_PORTION = 8
+_MOST_TIMES, _FEW = 5, 40
+"""How often mapping may place each image, on the average (models that overlap hold some again), as
+if there were so many more. Where a lens runs away, COLMAP begins up to 200 models that all fall to
+pieces."""
 _PAIR_TILE = 12
 """Pairs are taken in tiles of 12 x 12 images, whose features then stay in memory."""
 _PAIR_PORTION = 72
@@ -250,28 +254,42 @@ class Reconstructor:
         """Incremental mapping with its bundle adjustments: all models, in COLMAP's order.
 
         watch: receives the number of images placed so far. only: these images, all where none is
-        named.
+        named. Where models fall to pieces again and again, those that there are after _MOST_TIMES
+        as many placings as images are all.
         """
         output = Path(tempfile.mkdtemp(prefix="models-", dir=self.scratch))
         options = mapping_options(settings, self.num_threads, self.seed)
         options.image_names = [self.names[index] for index in only]
-        placed = [0]
+        most = _MOST_TIMES * ((len(only) or len(self.names)) + _FEW)
+        placed = 0
 
-        def count_one() -> None:
-            placed[0] += 1
+        def mapped(token: Any) -> Any:
+            def count_one() -> None:
+                nonlocal placed
+                placed += 1
+                if placed >= most:
+                    token.cancel()
 
-        found = self._run(
-            "mapping",
-            lambda token: pycolmap.incremental_mapping(
-                self.database,
-                self.links,
-                output,
-                options=options,
-                next_image_callback=count_one,
-                cancellation_token=token,
-            ),
-            lambda: watch(min(placed[0], len(self.names))),
-        )
+            try:
+                return pycolmap.incremental_mapping(
+                    self.database,
+                    self.links,
+                    output,
+                    options=options,
+                    next_image_callback=count_one,
+                    cancellation_token=token,
+                )
+            except InterruptedError:
+                if placed < most:
+                    raise
+                made = sorted(int(path.parent.name) for path in output.glob("*/images.bin"))
+                return {number: pycolmap.Reconstruction(output / str(number)) for number in made}
+
+        found = self._run("mapping", mapped, lambda: watch(min(placed, len(self.names))))
+        if not (settings.refine_distortion or only):
+            for number, model in found.items():
+                name_unbent(model)
+                model.write(output / str(number))
         return [
             sparse_model(model, output / str(number))
             for number, model in found.items()
@@ -297,6 +315,8 @@ class Reconstructor:
             placed=watch,
             tidied=tidied,
         )
+        if not settings.refine_distortion:
+            name_unbent(found)
         found.write(whole)
         steps = num_tidying_steps(len(self.names))
         tidied(steps - 1)

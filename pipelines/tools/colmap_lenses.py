@@ -292,3 +292,12 @@ def change_lens(camera: Any, lens: str) -> None:
     values = {"f": focal, "fl_x": focal, "fl_y": focal} | values
     camera.model = getattr(pycolmap.CameraModelId, lens)
     camera.params = np.array([values.get(name, 0.0) for name in names])
+
+
+def name_unbent(model: Any) -> None:
+    """Give cameras of a model whose one radial term mapping held, at none, the lens that has none:
+    no later adjustment bends it."""
+    for camera_id in model.cameras:
+        camera = model.camera(camera_id)
+        if camera.model.name == "SIMPLE_RADIAL" and camera.params[-1] == 0.0:
+            change_lens(camera, "SIMPLE_PINHOLE")

@@ -66,11 +66,12 @@ class MapperSettings:
     """How incremental mapping goes about it.
 
     thorough: bundle adjustment as often as COLMAP does by default, instead of after each growth by
-    40 %, and models that overlap others as far as they lead. thresholds: lower ones are for
-    captures that COLMAP's fail on.
+    40 %, and models that overlap others as far as they lead. refine_distortion: False holds lenses
+    as they start, without any. thresholds: lower ones are for captures that COLMAP's fail on.
     """
 
     refine_focal: bool = True
+    refine_distortion: bool = True
     refine_principal_point: bool = False
     thorough: bool = False
     thresholds: Thresholds = field(default_factory=Thresholds)
@@ -117,6 +118,8 @@ def mapping_options(settings: MapperSettings, num_threads: int, seed: int) -> An
     options.min_model_size = 3
     options.max_num_models = 10
     options.ba_refine_focal_length = settings.refine_focal
+    options.ba_refine_extra_params = settings.refine_distortion
+    options.mapper.abs_pose_refine_extra_params = settings.refine_distortion
     options.ba_refine_principal_point = settings.refine_principal_point
     if settings.thorough:
         # A later model may lead over an earlier one, and on: COLMAP ends it at 20 images of that.
