@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 from PIL import Image
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
@@ -56,13 +57,23 @@ def render(pose: np.ndarray) -> Image.Image:
 
 def picked(texture: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The texture, repeated by mirroring, at fractional positions."""
+    colors = np.empty((len(a), 3))
+    _pick(texture, a, b, colors)
+    return colors
+
+
+@njit(cache=True, error_model="numpy")
+def _pick(texture: np.ndarray, a: np.ndarray, b: np.ndarray, colors: np.ndarray) -> None:
     size = len(texture) - 1
-    a, b = (size - np.abs(values % (2 * size) - size) for values in (a, b))
-    i, j = np.minimum(a.astype(int), size - 1), np.minimum(b.astype(int), size - 1)
-    s, t = (a - i)[:, None], (b - j)[:, None]
-    top = texture[i, j] * (1 - t) + texture[i, j + 1] * t
-    bottom = texture[i + 1, j] * (1 - t) + texture[i + 1, j + 1] * t
-    return top * (1 - s) + bottom * s
+    for n in range(len(a)):
+        x = size - abs(a[n] % (2 * size) - size)
+        y = size - abs(b[n] % (2 * size) - size)
+        i, j = min(int(x), size - 1), min(int(y), size - 1)
+        s, t = x - i, y - j
+        for c in range(3):
+            top = texture[i, j, c] * (1 - t) + texture[i, j + 1, c] * t
+            bottom = texture[i + 1, j, c] * (1 - t) + texture[i + 1, j + 1, c] * t
+            colors[n, c] = top * (1 - s) + bottom * s
 
 
 def arc_poses(num: int) -> np.ndarray:

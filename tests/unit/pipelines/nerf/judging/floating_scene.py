@@ -48,24 +48,27 @@ class Scene:
             depth = torch.where((leave > enter) & (enter > 0), torch.minimum(depth, enter), depth)
         return depth
 
-    def thickness(self, origins: Tensor, ways: Tensor, upto: Tensor) -> Tensor:
-        """Optical thickness of the fog between 0 and `upto` along each ray [R]."""
-        total = torch.zeros_like(upto)
+    def fog(self, origins: Tensor, ways: Tensor) -> list[tuple[float, Tensor, Tensor]]:
+        """Of each fog ball that a ray meets: thickness per length, where rays enter and leave [R].
+
+        A ray that starts inside enters at 0.
+        """
+        met = []
         for ball in self.floaters:
             enter, leave = chord(origins, ways, ball)
-            inside = torch.minimum(leave, upto) - enter.clamp_min(0.0)
-            total += self.kappa / (2.0 * ball[3]) * inside.clamp_min(0.0)
-        return total
+            if bool((leave > 0.0).any()):
+                met.append((self.kappa / (2.0 * ball[3]), enter.clamp_min(0.0), leave))
+        return met
 
     def median_depth(self, origins: Tensor, ways: Tensor) -> Tensor:
         """Where half of the light is gone [R]; bisection, as thickness only grows."""
         depth = self.solid_depth(origins, ways)
-        foggy = self.thickness(origins, ways, depth) >= LN2
-        starts, ways = origins[foggy], ways[foggy]
+        foggy = thickness(self.fog(origins, ways), depth) >= LN2
+        fog = self.fog(origins[foggy], ways[foggy])
         low, high = torch.zeros_like(depth[foggy]), depth[foggy]
         for _ in range(30):
             middle = 0.5 * (low + high)
-            gone = self.thickness(starts, ways, middle) >= LN2
+            gone = thickness(fog, middle) >= LN2
             low, high = torch.where(gone, low, middle), torch.where(gone, middle, high)
         depth[foggy] = high
         return depth
@@ -73,7 +76,7 @@ class Scene:
     def opacity_before(self, origins: Tensor, ways: Tensor, t: float) -> Tensor:
         """Chance to end before t [R]."""
         upto = torch.full_like(origins[:, 0], t)
-        fog = -torch.expm1(-self.thickness(origins, ways, upto))
+        fog = -torch.expm1(-thickness(self.fog(origins, ways), upto))
         return torch.where(self.solid_depth(origins, ways) < t, torch.ones_like(fog), fog)
 
     def render_rays(self, origins: Tensor, ways: Tensor) -> Picture:
@@ -87,6 +90,14 @@ class Scene:
 class Picture:
     depth: np.ndarray
     accumulation: np.ndarray
+
+
+def thickness(fog: list[tuple[float, Tensor, Tensor]], upto: Tensor) -> Tensor:
+    """Optical thickness between 0 and `upto` along each ray [R] of what `Scene.fog` finds."""
+    total = torch.zeros_like(upto)
+    for per_length, enter, leave in fog:
+        total += per_length * (torch.minimum(leave, upto) - enter).clamp_min(0.0)
+    return total
 
 
 def chord(origins: Tensor, ways: Tensor, ball: tuple[float, ...]) -> tuple[Tensor, Tensor]:
