@@ -117,12 +117,15 @@ def _with_what_many_see(bounds: SceneBounds, seen: Sequence[Floats]) -> SceneBou
     """
     near = [part[np.linalg.norm(part - bounds.focus, axis=1) <= bounds.radius] for part in seen]
     points = np.concatenate(near)
+    if len(points) == 0:
+        return bounds
     cells = np.floor((points - bounds.focus) * (_CELLS / bounds.distance)).astype(np.int64)
     view = np.repeat(np.arange(len(near)), [len(part) for part in near])
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    pairs = np.unique(np.stack([cell.reshape(-1), view]), axis=1)
-    votes = np.bincount(pairs[0])
-    sure = points[votes[cell.reshape(-1)] >= max(2.0, _SURE_SHARE * len(seen))]
+    # Cells, and pairs of cell and view, as one number each: rows of several sort ten times as long.
+    x, y, z = (cells - cells.min(axis=0)).T
+    _, cell = np.unique((x * (y.max() + 1) + y) * (z.max() + 1) + z, return_inverse=True)
+    votes = np.bincount(np.unique(cell * len(near) + view) // len(near))
+    sure = points[votes[cell] >= max(2.0, _SURE_SHARE * len(seen))]
     beyond = sure[~bounds.contains(sure)]
     if len(beyond) == 0:
         return bounds
