@@ -106,8 +106,8 @@ def depth_error(config: TrainConfig, maps: DepthMaps | None) -> float:
 
 def test_maps_bring_light_to_where_the_surface_is() -> None:
     maps = exact_maps(toy_cameras(12))
-    told = tiny_config(max_steps=160, depth=DepthLossConfig(weight=0.05, weight_final=0.05))
-    without = depth_error(tiny_config(max_steps=160), None)
+    told = tiny_config(max_steps=80, depth=DepthLossConfig(weight=0.05, weight_final=0.05))
+    without = depth_error(tiny_config(max_steps=80), None)
     assert depth_error(told, maps) < 0.7 * without
 
 
