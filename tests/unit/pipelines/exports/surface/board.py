@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +33,7 @@ def wall_color(x: Floats, y: Floats) -> Floats:
     return _shaded([0.25, 0.4, 0.6], 0.05 * np.cos(5.0 * x + 3.0 * y))
 
 
+@functools.cache
 def photos() -> list[ColorView]:
     """Five of them, each from elsewhere, in a world whose origin is far away."""
     eyes = ((0.0, 0.0), (0.5, 0.1), (-0.5, -0.1), (0.1, 0.4), (-0.2, -0.4))
