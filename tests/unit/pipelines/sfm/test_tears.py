@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from PIL import Image
 
 from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import Intrinsics
@@ -150,6 +152,12 @@ def test_near_in_time_is_an_eighth_of_a_clip_at_most(num: int, window: int) -> N
     assert not order.is_far((0, 5 * num)), "of none"
 
 
+@functools.cache
+def walked_round(num: int) -> list[Image.Image]:
+    """Pictures of the can from all around."""
+    return [render(pose) for pose in around_poses(num, 360.0)]
+
+
 def climbed(root: Path, rungs: tuple[Rung, ...] = RUNGS) -> tuple[Outcome, Source]:
     workspace = Workspace(root)
     ctx = StageContext("poses", workspace, root, workspace.checkpoint("poses"))
@@ -174,7 +182,7 @@ def turns_off_deg(model: SparseModel, poses: Floats) -> Floats:
 @pytest.mark.parametrize("kind", ["film", "photos", "long film"])
 def test_a_can_with_its_label_on_it_twice_is_found_whole(tmp_path: Path, kind: str) -> None:
     num = 156 if kind == "long film" else NUM
-    pictures = [render(pose) for pose in around_poses(num, 360.0)]
+    pictures = walked_round(num)
     if kind == "photos":
         save_photos(tmp_path, pictures)
     else:
@@ -194,7 +202,7 @@ def test_a_film_that_cannot_be_mended_is_told_as_torn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without its far pairs nothing of it is placed, here by force: the path stays torn."""
-    save_video_frames(tmp_path, [render(pose) for pose in around_poses(NUM, 360.0)])
+    save_video_frames(tmp_path, walked_round(NUM))
     whole = Reconstructor.without_pairs
     monkeypatch.setattr(
         Reconstructor,
