@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.unit.pipelines.sfm.synthetic_room import (
-    FOCAL,
     HEIGHT,
     WIDTH,
     blobs,
     picked,
     pose_looking_at,
+    rays_of,
 )
 
 RADIUS, TALL, PLATE = 0.45, 0.9, 0.75
@@ -35,10 +35,7 @@ def turned_poses(num: int, turn_deg: float = 360.0) -> np.ndarray:
 def render(pose: np.ndarray) -> tuple[Image.Image, np.ndarray]:
     """The picture, and [H, W], where it shows what turns."""
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    local = np.stack(
-        [(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL, -np.ones_like(u)], axis=-1
-    )
-    rays, center = local @ pose[:, :3].T, pose[:, 3]
+    rays, center = rays_of(pose), pose[:, 3]
     picture = picked(_ROOM, 2.0 * u.ravel(), 2.0 * v.ravel()).reshape(HEIGHT, WIDTH, 3)
     plate = _met(rays, center, 0.0, PLATE)
     spots = (center + rays * plate[..., None])[np.isfinite(plate)]

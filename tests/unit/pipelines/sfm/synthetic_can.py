@@ -6,12 +6,12 @@ import numpy as np
 from PIL import Image
 
 from tests.unit.pipelines.sfm.synthetic_room import (
-    FOCAL,
     HEIGHT,
     WIDTH,
     blobs,
     picked,
     pose_looking_at,
+    rays_of,
 )
 
 RADIUS, TALL = 0.45, 1.0
@@ -35,11 +35,7 @@ def around_poses(num: int, turn_deg: float) -> np.ndarray:
 
 def render(pose: np.ndarray) -> Image.Image:
     """The can z in [0, TALL] around the z axis, on a floor of one faint pattern."""
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    local = np.stack(
-        [(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL, -np.ones_like(u)], axis=-1
-    )
-    rays, center = local @ pose[:, :3].T, pose[:, 3]
+    rays, center = rays_of(pose), pose[:, 3]
     # Where rays meet the wall of the can: |center + t ray| = RADIUS in x and y.
     square = (rays[..., :2] ** 2).sum(axis=-1)
     half = (rays[..., :2] * center[:2]).sum(axis=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 
@@ -24,7 +25,7 @@ def blobs(seed: int) -> np.ndarray:
     return np.clip((total - low) / (high - low) * 255, 0, 255)
 
 
-_TEXTURES = [blobs(seed) for seed in range(3)]
+_TEXTURES = np.stack([blobs(seed) for seed in range(3)])
 
 
 def pose_looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -35,23 +36,23 @@ def pose_looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z, center], axis=1)
 
 
+def rays_of(pose: np.ndarray) -> np.ndarray:
+    """[H, W, 3], world axes, through the pixels' centres."""
+    rays: np.ndarray = _local_rays() @ pose[:, :3].T
+    return rays
+
+
+@functools.cache
+def _local_rays() -> np.ndarray:
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    return np.stack([(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL, -np.ones_like(u)], axis=-1)
+
+
 def render(pose: np.ndarray) -> Image.Image:
     """The walls x = 0 and y = 0 and the floor z = 0, seen from within x, y, z > 0."""
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    local = np.stack(
-        [(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL, -np.ones_like(u)], axis=-1
-    )
-    rays = local @ pose[:, :3].T
-    center = pose[:, 3]
-    with np.errstate(divide="ignore"):
-        distances = np.where(rays < 0, -center / rays, np.inf)
-    wall = distances.argmin(axis=-1)
-    hit = center + rays * distances.min(axis=-1)[..., None]
-    picture = np.zeros((HEIGHT, WIDTH, 3))
-    for axis, texture in enumerate(_TEXTURES):
-        here = wall == axis
-        a, b = (hit[here][:, other] * _TEXTURE_PER_UNIT for other in range(3) if other != axis)
-        picture[here] = picked(texture, a, b)
+    picture = np.empty((HEIGHT, WIDTH, 3))
+    center = np.ascontiguousarray(pose[:, 3])
+    _paint_walls(rays_of(pose).reshape(-1, 3), center, _TEXTURES, picture.reshape(-1, 3))
     return Image.fromarray(picture.round().astype(np.uint8))
 
 
@@ -63,17 +64,35 @@ def picked(texture: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
+def _paint_walls(
+    rays: np.ndarray, center: np.ndarray, textures: np.ndarray, colors: np.ndarray
+) -> None:
+    for n in range(len(rays)):
+        wall, nearest = 0, np.inf
+        for axis in range(3):
+            if rays[n, axis] < 0 and -center[axis] / rays[n, axis] < nearest:
+                wall, nearest = axis, -center[axis] / rays[n, axis]
+        hit = (center + rays[n] * nearest) * _TEXTURE_PER_UNIT
+        a, b = hit[1 if wall == 0 else 0], hit[1 if wall == 2 else 2]
+        _pick_one(textures[wall], a, b, colors[n])
+
+
+@njit(cache=True, error_model="numpy")
 def _pick(texture: np.ndarray, a: np.ndarray, b: np.ndarray, colors: np.ndarray) -> None:
-    size = len(texture) - 1
     for n in range(len(a)):
-        x = size - abs(a[n] % (2 * size) - size)
-        y = size - abs(b[n] % (2 * size) - size)
-        i, j = min(int(x), size - 1), min(int(y), size - 1)
-        s, t = x - i, y - j
-        for c in range(3):
-            top = texture[i, j, c] * (1 - t) + texture[i, j + 1, c] * t
-            bottom = texture[i + 1, j, c] * (1 - t) + texture[i + 1, j + 1, c] * t
-            colors[n, c] = top * (1 - s) + bottom * s
+        _pick_one(texture, a[n], b[n], colors[n])
+
+
+@njit(cache=True, error_model="numpy")
+def _pick_one(texture: np.ndarray, a: float, b: float, color: np.ndarray) -> None:
+    size = len(texture) - 1
+    a, b = size - abs(a % (2 * size) - size), size - abs(b % (2 * size) - size)
+    i, j = min(int(a), size - 1), min(int(b), size - 1)
+    s, t = a - i, b - j
+    for c in range(3):
+        top = texture[i, j, c] * (1 - t) + texture[i, j + 1, c] * t
+        bottom = texture[i + 1, j, c] * (1 - t) + texture[i + 1, j + 1, c] * t
+        color[c] = top * (1 - s) + bottom * s
 
 
 def arc_poses(num: int) -> np.ndarray:
