@@ -50,7 +50,8 @@ def common_rim(files: Sequence[Path], ctx: StageContext) -> Bools | None:
     for file in [files[index] for index in evenly_picked(len(files), _MOST_PICTURES)]:
         ctx.check_cancelled()
         with PIL.Image.open(file) as opened:
-            black = np.asarray(opened.convert("RGB")).max(axis=2) <= _BLACK
+            red, green, blue = map(np.asarray, opened.convert("RGB").split())
+        black = np.maximum(np.maximum(red, green), blue) <= _BLACK
         common = black if common is None else common & black
         if _border(common).mean() < _LEAST_BORDER:
             return None
