@@ -192,10 +192,12 @@ def _gain(picture: Colors, usual: Floats) -> Floats:
     rim = max(1, round(_BORDER * min(picture.shape[:2])))
     at_border = np.ones(picture.shape[:2], np.bool_)
     at_border[rim:-rim, rim:-rim] = False
-    bright = at_border & (usual.min(axis=2) > 16) & (usual.max(axis=2) < 240)
+    border = usual[at_border]
+    bright = (border.min(axis=1) > 16) & (border.max(axis=1) < 240)
     if bright.sum() < 16:
         return np.ones(3, np.float32)
-    gain: Floats = np.median(picture[bright] / usual[bright], axis=0).astype(np.float32)
+    brighter = picture[at_border][bright] / border[bright]
+    gain: Floats = np.median(brighter, axis=0).astype(np.float32)
     return np.clip(gain, 0.5, 2.0)
 
 
