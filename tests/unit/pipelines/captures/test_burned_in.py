@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,11 +28,15 @@ Lay = Callable[[PIL.Image.Image], object]
 
 def scene(seed: int, size: tuple[int, int] = (_WIDTH, _HEIGHT)) -> PIL.Image.Image:
     """A part of a large patterned wall, elsewhere in each picture."""
+    x, y = np.random.default_rng(100 + seed).integers((0, 0), (1920 - size[0], 1080 - size[1]))
+    return _wall().crop((x, y, x + size[0], y + size[1]))
+
+
+@functools.cache
+def _wall() -> PIL.Image.Image:
     rng = np.random.default_rng(7)
     wall = PIL.Image.fromarray(rng.integers(20, 235, (90, 160, 3), np.uint8))
-    wall = wall.resize((1920, 1080), PIL.Image.Resampling.BICUBIC)
-    x, y = np.random.default_rng(100 + seed).integers((0, 0), (1920 - size[0], 1080 - size[1]))
-    return wall.crop((x, y, x + size[0], y + size[1]))
+    return wall.resize((1920, 1080), PIL.Image.Resampling.BICUBIC)
 
 
 def date(picture: PIL.Image.Image) -> None:
