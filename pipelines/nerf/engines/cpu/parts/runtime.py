@@ -29,9 +29,15 @@ from typing import Any
 import numba
 import torch
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    UserProvidedCacheLocator,
+)
 
 SHARES_PER_THREAD = 8
+_PACKAGE = Path(__file__).resolve().parents[3]
+"""The folder of the package pipelines.nerf."""
 
 FROZEN_ROOMS = ("options", "space", "along_ray", "networks", "models", "engines/cpu")
 """Rooms of pipelines/nerf that kernels come from: a global that a kernel reads is a constant of its
@@ -61,7 +67,7 @@ def kernel_version(nerf: Path) -> str:
 
 def _cache_folder() -> Path:
     """The folder for compiled kernels: the first choice that can be written."""
-    name = f"kernels-{kernel_version(Path(__file__).resolve().parents[3])}"
+    name = f"kernels-{kernel_version(_PACKAGE)}"
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     home = os.environ.get("NERFWORKS_HOME")
     if chosen:
@@ -99,6 +105,25 @@ def file_lock(path: Path, operation: int) -> Iterator[None]:
         os.close(descriptor)
 
 
+class _Locator(UserProvidedCacheLocator):
+    """Names a module's place in the cache by where it lies in the package, not on the disk.
+
+    The cache folder's digest says that the sources are the same: so what was compiled serves every
+    copy of them. By numba's own names a second copy would find none of it, though the marks say
+    that all is compiled (`pipelines.nerf.compiling`).
+    """
+
+    def get_cache_path(self) -> str:
+        source = Path(self._py_file).resolve()
+        if not source.is_relative_to(_PACKAGE):
+            return str(super().get_cache_path())  # type: ignore[no-untyped-call]
+        return str(CACHE_FOLDER / ".".join(source.relative_to(_PACKAGE).parts[:-1]))
+
+
+class _CacheImpl(CompileResultCacheImpl):
+    _locator_classes = (_Locator,)
+
+
 class _SharedCache(FunctionCache):
     """Numba's cache of one function, safe for several processes at once.
 
@@ -106,6 +131,8 @@ class _SharedCache(FunctionCache):
     different signatures of one function together may take the same number, and whoever loads one
     later would run the other's code.
     """
+
+    _impl_class = _CacheImpl
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with file_lock(CACHE_FOLDER / "lock", fcntl.LOCK_SH):

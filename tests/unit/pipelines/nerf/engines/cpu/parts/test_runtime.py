@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import shutil
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -100,6 +103,32 @@ def test_kernels_are_compiled_anew_when_a_constant_in_them_changes(
     # What no kernel is made of may change without compiling anything.
     (copied / "judging" / "metrics.py").write_text("", "utf-8")
     assert runtime.kernel_version(copied) == version
+
+
+def test_what_one_copy_of_the_sources_has_compiled_serves_another(tmp_path: Path) -> None:
+    code = (
+        "from pipelines.nerf.engines.cpu.parts import dense_layers, runtime;"
+        "import numpy as np, torch;"
+        "out = np.zeros((4, dense_layers.TILE), np.float32);"
+        "layer = dense_layers.pack_layer(torch.nn.Linear(4, 4));"
+        "dense_layers.apply_layer(out, layer, 4, True, False, out.copy());"
+        "print(dense_layers.__file__, runtime.compile_seconds())"
+    )
+    copied = tmp_path / "elsewhere" / "pipelines"
+    ours = Path(nerf.__file__).parents[1]
+    shutil.copytree(ours, copied, ignore=shutil.ignore_patterns("__pycache__"))
+    seconds = []
+    for root in (ours.parent, copied.parent):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(root)}
+        command = [sys.executable, "-P", "-c", code]
+        told = subprocess.run(
+            command, env=environment, cwd=tmp_path, check=True, capture_output=True, text=True
+        )
+        file, spent = told.stdout.split()
+        assert Path(file).is_relative_to(root)
+        seconds.append(float(spent))
+    assert seconds[0] > 0.0
+    assert seconds[1] == 0.0
 
 
 def test_a_lock_that_is_held_can_be_refused(tmp_path: Path) -> None:
