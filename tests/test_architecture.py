@@ -124,6 +124,7 @@ NERF_ROOMS: tuple[tuple[str, ...], ...] = (
     ("judging",),
     ("training",),
     ("renderer",),
+    ("made_jobs",),
     ("compiling",),
 )
 
@@ -362,10 +363,10 @@ def test_programs_are_never_started_through_a_shell() -> None:
 
 def test_kernels_take_nothing_from_rooms_that_their_cache_does_not_follow() -> None:
     nerf = ROOT / "pipelines" / "nerf"
-    runtime = ast.parse((nerf / "engines/cpu/parts/runtime.py").read_text("utf-8"))
+    cache = ast.parse((nerf / "engines/cpu/parts/kernel_cache.py").read_text("utf-8"))
     (rooms,) = (
         ast.literal_eval(node.value)
-        for node in runtime.body
+        for node in cache.body
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "FROZEN_ROOMS"
     )
     followed = tuple(f"pipelines.nerf.{room.replace('/', '.')}" for room in rooms)

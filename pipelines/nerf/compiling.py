@@ -2,11 +2,10 @@
 
     python -m pipelines.nerf.compiling PART [--background] < list-of-options.json
 
-A part is a tiny job on made data: some depth maps, two steps of `train`, or one picture of
-`Renderer`. So whatever
-kernels those launch is compiled, with the types that they have in a job, and nothing here knows
-their names. numba compiles with one thread a process; `compile_kernels` therefore runs the parts in
-processes of their own, side by side, and on two cores nobody waits for more than the longer one.
+A part is a tiny job on made data (`pipelines.nerf.made_jobs`): some depth maps, two steps of
+`train`, or one picture of `Renderer`. numba compiles with one thread a process; `compile_kernels`
+therefore runs the parts in processes of their own, side by side, and on two cores nobody waits for
+more than the longer one.
 
 Files in the cache folder: `PART.lock` is held by who compiles, so that others wait instead of
 compiling the same; `PART.progress` says how far it is; `PART-KIND.done` says that all is compiled
@@ -15,6 +14,8 @@ for options of a kind. Kinds differ where the types of a kernel's arguments may.
 A background compiler has the least priority and writes its process id into the lock. Who waits for
 it and sees that it gets less than half a processor ends it and compiles in its place: kernels that
 it had finished stay.
+
+Neither torch nor numba is loaded before there is something to compile: a worker asks at each start.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ import fcntl
 import hashlib
 import json
 import logging
-import math
 import os
 import signal
 import subprocess
@@ -37,26 +37,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from llvmlite.binding import get_host_cpu_name  # type: ignore[import-untyped]
 
-from pipelines.nerf.data.images import ImageData
-from pipelines.nerf.engines.cpu.parts.runtime import (
-    CACHE_FOLDER,
-    count_as_compiling,
-    file_lock,
-    kernels_compiled,
-    kernels_known,
-)
-from pipelines.nerf.options.catalogue import find_method
-from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.engines.cpu.parts.kernel_cache import CACHE_FOLDER, file_lock
 from pipelines.nerf.options.train import TrainConfig, config_from_dict
-from pipelines.nerf.renderer import Renderer
-from pipelines.nerf.space.cameras import Cameras, SceneTransform
-from pipelines.nerf.stereo.maps import find_depth_maps
-from pipelines.nerf.stereo.refinement import Pictures, photo_offsets
-from pipelines.nerf.stereo.views import StereoView
-from pipelines.nerf.training.loop import train
 
 PARTS = ("stereo", "training", "rendering")
 OnProgress = Callable[[int, int], None]
@@ -66,10 +50,6 @@ _log = logging.getLogger("nerfworks.nerf")
 _POLL_S = 0.1
 _PROGRESS_STEP_S = 0.2
 _PATIENCE_S = 2.0
-_MOST = {"log2_table_size": 10, "occupancy_resolution": 16, "num_steps": 64, "max_samples": 4096}
-"""Options of models that decide sizes only, and what is enough here."""
-_SIDE_PX, _NUM_IMAGES, _NUM_RAYS, _NUM_STEPS = 16, 4, 64, 2
-_SCENE = SceneTransform((0.0, 0.0, 0.0), 1.0)
 
 
 def kind_of(config: TrainConfig) -> str:
@@ -128,6 +108,9 @@ def compile_kernels(config: TrainConfig, on_progress: OnProgress) -> None:
             if status := process.wait():
                 _log.warning("the kernels for %s were not compiled: status %s", part, status)
         if started:
+            # Here and below: the compiler is loaded where something is compiled, or was.
+            from pipelines.nerf.engines.cpu.parts.runtime import count_as_compiling
+
             count_as_compiling(time.monotonic() - begun)
 
 
@@ -159,78 +142,10 @@ def _progress_of(parts: Sequence[str]) -> tuple[int, int]:
     return done, known
 
 
-def run_part(part: str, config: TrainConfig) -> None:
-    """Launch in this process every kernel that the part of a job launches."""
-    tiny = _tiny(config)
-    cameras, images = _made_capture()
-    if part == "stereo":
-        _find_made_depth()
-    elif part == "training":
-        train(images, cameras, range(_NUM_IMAGES), tiny, seed=0)
-    else:
-        model = find_method(tiny.method).build(tiny.model, _NUM_IMAGES).eval()
-        Renderer(model, _SCENE, device="cpu").render(cameras, 0)
-
-
-def _tiny(config: TrainConfig) -> TrainConfig:
-    """The run shortened and its tables and grids made small: neither changes a type."""
-    return dataclasses.replace(
-        config,
-        max_steps=_NUM_STEPS,
-        max_seconds=0.0,
-        rays_per_step=_NUM_RAYS,
-        device="cpu",
-        model=_small(config.model),
-    )
-
-
-def _small(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return tuple(_small(item) for item in value)
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        return value
-    changes = {}
-    for item in dataclasses.fields(value):
-        given = getattr(value, item.name)
-        changes[item.name] = min(given, _MOST[item.name]) if item.name in _MOST else _small(given)
-    return dataclasses.replace(value, **changes)
-
-
-def _made_capture() -> tuple[Cameras, ImageData]:
-    """Grey pictures by cameras on a ring of radius 1/2 that look at its middle, in scene space."""
-    poses = []
-    for index in range(_NUM_IMAGES):
-        angle = 2.0 * math.pi * index / _NUM_IMAGES
-        back = np.array([math.cos(angle), math.sin(angle), 0.0])
-        right = np.array([-math.sin(angle), math.cos(angle), 0.0])
-        poses.append(np.stack([right, [0.0, 0.0, 1.0], back, 0.5 * back], axis=-1))
-    cameras = Cameras.from_arrays(
-        world_from_camera=np.stack(poses),
-        scene=_SCENE,
-        widths=[_SIDE_PX] * _NUM_IMAGES,
-        heights=[_SIDE_PX] * _NUM_IMAGES,
-        focal=[(float(_SIDE_PX), float(_SIDE_PX))] * _NUM_IMAGES,
-        principal=[(_SIDE_PX / 2, _SIDE_PX / 2)] * _NUM_IMAGES,
-    )
-    grey = np.full((_SIDE_PX, _SIDE_PX, 3), 128, np.uint8)
-    return cameras, ImageData.from_arrays([grey] * _NUM_IMAGES)
-
-
-def _find_made_depth() -> None:
-    """Depth maps of three cameras in a row before a grey wall, whose points are known."""
-    lens = (float(_SIDE_PX), float(_SIDE_PX), _SIDE_PX / 2, _SIDE_PX / 2)
-    grey = np.full((_SIDE_PX, _SIDE_PX), 0.5, np.float32)
-    places = np.array([[-0.2, 0.0, 0.0], [0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
-    views = [StereoView(grey, lens, np.column_stack([np.eye(3), place])) for place in places]
-    wall = np.column_stack([np.linspace(-0.5, 0.5, 50), np.zeros(50), np.full(50, 2.0)])
-    find_depth_maps(views, StereoConfig(num_planes=16), wall)
-    toward = np.tile([0.0, 0.0, -1.0], (len(wall), 1))
-    everywhere = np.ones((len(views), len(wall)), np.uint8)
-    photo_offsets(wall, toward, everywhere, Pictures.of(views, np.zeros(3)), 1)
-
-
 def load_compiled(config: TrainConfig) -> None:
     """Load into this process what lies compiled, so that the first step need not."""
+    from pipelines.nerf.made_jobs import run_part
+
     for part in PARTS:
         if _marker(part, config).exists():
             run_part(part, config)
@@ -244,6 +159,8 @@ def _wanted_file(lock: Path) -> Path:
 def _watch(part: str, parent: int, background: bool) -> None:
     """Say how far the compilation is; end this process when nobody is there to use it, or when it
     stands in the way."""
+    from pipelines.nerf.engines.cpu.parts.runtime import kernels_compiled, kernels_known
+
     path, wanted = _progress_file(part), _wanted_file(CACHE_FOLDER / f"{part}.lock")
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     while os.getppid() == parent and not (background and wanted.exists()):
@@ -297,6 +214,10 @@ def main(arguments: list[str] | None = None) -> None:
     if chosen.background:
         os.nice(19)
     configs = [config_from_dict(TrainConfig, values) for values in json.loads(sys.stdin.read())]
+    if all(_marker(part, config).exists() for config in configs):
+        return
+    from pipelines.nerf.made_jobs import run_part
+
     watched = (part, chosen.parent, chosen.background)
     watch = threading.Thread(target=_watch, args=watched, daemon=True)
     watch.start()

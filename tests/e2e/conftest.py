@@ -12,7 +12,7 @@ import pytest
 from api.client.client import Client
 from deploy.embedded import Embedded, free_port
 from deploy.supervisor import Supervisor
-from pipelines.nerf.engines.cpu.parts.runtime import CACHE_FOLDER
+from pipelines.nerf.engines.cpu.parts.kernel_cache import CACHE_FOLDER
 from tests.samples import sample_clip
 
 

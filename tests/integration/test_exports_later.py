@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pipelines.nerf.engines.cpu.parts.runtime import CACHE_FOLDER
+from pipelines.nerf.engines.cpu.parts.kernel_cache import CACHE_FOLDER
 from pipelines.registry import get_stage
 from storage.exports import create_export, open_for_export
 from storage.jobs import ready_stage_ids

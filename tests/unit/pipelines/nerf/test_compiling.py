@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import json
 import subprocess
 import sys
 import time
@@ -15,7 +16,8 @@ import pytest
 import torch
 
 from pipelines.nerf import compiling as warm
-from pipelines.nerf.engines.cpu.parts import runtime
+from pipelines.nerf import made_jobs
+from pipelines.nerf.engines.cpu.parts import kernel_cache, runtime
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.options.train import TrainConfig, default_train_config
@@ -31,11 +33,11 @@ PREVIEW = train_config(stage_options("train", resolve_options("preview", {})["tr
 
 def test_after_warming_up_a_job_compiles_nothing() -> None:
     for part in warm.PARTS:
-        warm.run_part(part, PREVIEW)
+        made_jobs.run_part(part, PREVIEW)
     before, launched = runtime.compile_seconds(), runtime.kernels_known()
     assert launched > 5
     config = dataclasses.replace(PREVIEW, max_steps=6, rays_per_step=700, device="cpu")
-    cameras, images = warm._made_capture()
+    cameras, images = made_jobs.made_capture()
     model = train(images, cameras, range(3), config, seed=1)
     Renderer(model, SceneTransform((0.1, 0.2, 0.3), 2.0)).render(cameras.resized(7), 1)
     views, _ = row_of_cameras(5)
@@ -47,7 +49,7 @@ def test_after_warming_up_a_job_compiles_nothing() -> None:
 def test_every_method_can_be_warmed_up(method: str) -> None:
     config = default_train_config(method)
     small = dataclasses.replace(config, engine="plain")
-    warm.run_part("training", small)
+    made_jobs.run_part("training", small)
 
 
 def test_options_that_change_only_numbers_are_of_one_kind() -> None:
@@ -77,7 +79,7 @@ def test_options_that_change_only_numbers_are_of_one_kind() -> None:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache folder of its own, here and in processes that are started."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    made = tmp_path / runtime.CACHE_FOLDER.name
+    made = tmp_path / kernel_cache.CACHE_FOLDER.name
     made.mkdir()
     monkeypatch.setattr(warm, "CACHE_FOLDER", made)
     return made
@@ -95,6 +97,24 @@ def test_nothing_is_started_where_all_is_compiled(folder: Path) -> None:
     warm.compile_kernels(PREVIEW, lambda done, known: calls.append((done, known)))
     assert calls == []
     assert runtime.compile_seconds() == before
+
+
+def test_a_compiler_that_has_nothing_to_do_loads_no_compiler(folder: Path) -> None:
+    mark_all(folder)
+    program = (
+        "import sys\n"
+        "from pipelines.nerf import compiling\n"
+        "compiling.main(['training'])\n"
+        "print({'torch', 'numba'} & set(sys.modules))\n"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", program],
+        input=json.dumps([dataclasses.asdict(PREVIEW)]).encode(),
+        capture_output=True,
+        check=True,
+    )
+    assert told.stdout == b"set()\n"
+    assert not list(folder.glob("*.lock"))
 
 
 def test_a_cancel_while_kernels_compile_ends_the_compilers(
@@ -160,7 +180,9 @@ def test_a_background_compiler_without_processor_time_is_replaced(
         warm._hold_lock(tmp_path / "lock", stack)
         assert process.wait(10) == -15
         with pytest.raises(BlockingIOError):
-            stack.enter_context(runtime.file_lock(tmp_path / "lock", fcntl.LOCK_EX | fcntl.LOCK_NB))
+            stack.enter_context(
+                kernel_cache.file_lock(tmp_path / "lock", fcntl.LOCK_EX | fcntl.LOCK_NB)
+            )
 
 
 def test_another_jobs_compiler_is_waited_for(
@@ -201,5 +223,5 @@ def test_warming_up_leaves_the_callers_random_numbers_alone() -> None:
     torch.manual_seed(5)
     wanted = torch.rand(3)
     torch.manual_seed(5)
-    warm.run_part("training", PREVIEW)
+    made_jobs.run_part("training", PREVIEW)
     assert torch.equal(torch.rand(3), wanted)

@@ -5,26 +5,20 @@ Threads: kernels are single-threaded functions that release the interpreter's lo
 This needs no threading layer of numba's (no libgomp, no tbb), compiles in a third of the time, and
 several callers may run at once.
 
-Cache: compiled code is kept in NUMBA_CACHE_DIR, else NERFWORKS_HOME/numba, else
-~/.cache/nerfworks/numba, so that a read-only install compiles once and not in every process. Numba
-does not notice when a function called by a cached one changes; the folder therefore carries a
-digest of all sources that kernels are made of or freeze constants from. Processes that share it
-take turns (`_SharedCache`). `warm` fills it before anybody waits.
+Cache: compiled code is kept in the folder that `kernel_cache` names. Processes that share it take
+turns (`_SharedCache`). `pipelines.nerf.compiling` fills it before anybody waits.
 """
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
-import hashlib
 import inspect
 import os
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numba
 import torch
@@ -35,13 +29,9 @@ from numba.core.caching import (
     UserProvidedCacheLocator,
 )
 
-SHARES_PER_THREAD = 8
-_PACKAGE = Path(__file__).resolve().parents[3]
-"""The folder of the package pipelines.nerf."""
+from pipelines.nerf.engines.cpu.parts.kernel_cache import CACHE_FOLDER, PACKAGE, file_lock
 
-FROZEN_ROOMS = ("options", "space", "along_ray", "networks", "models", "engines/cpu")
-"""Rooms of pipelines/nerf that kernels come from: a global that a kernel reads is a constant of its
-compiled code, wherever it was imported from. `tests/test_architecture.py` holds the list."""
+SHARES_PER_THREAD = 8
 
 # Everything but the promise that there are no NaN: a diverged training must show, not hide.
 FAST_MATH = {"contract", "reassoc", "nsz", "arcp", "afn"}
@@ -53,56 +43,7 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-def kernel_version(nerf: Path) -> str:
-    """What changes with this numba and with every source that kernels may be made of.
-
-    nerf: the folder of the package pipelines.nerf.
-    """
-    digest = hashlib.sha256(numba.__version__.encode())
-    for room in FROZEN_ROOMS:
-        for source in sorted((nerf / room).rglob("*.py")):
-            digest.update(source.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _cache_folder() -> Path:
-    """The folder for compiled kernels: the first choice that can be written."""
-    name = f"kernels-{kernel_version(_PACKAGE)}"
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    home = os.environ.get("NERFWORKS_HOME")
-    if chosen:
-        base = Path(chosen)
-    elif home:
-        base = Path(home) / "numba"
-    else:
-        base = Path("~/.cache/nerfworks/numba").expanduser()
-    for candidate in (base / name, Path(tempfile.gettempdir()) / f"nerfworks-{os.getuid()}" / name):
-        try:
-            candidate.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(candidate, os.W_OK):
-            return candidate
-    raise OSError("no writable folder for compiled kernels: set NUMBA_CACHE_DIR to one")
-
-
-CACHE_FOLDER = _cache_folder()
-"""Where compiled kernels of these sources and this numba lie."""
 numba.config.CACHE_DIR = str(CACHE_FOLDER)  # type: ignore[attr-defined]
-
-
-@contextlib.contextmanager
-def file_lock(path: Path, operation: int) -> Iterator[None]:
-    """Hold a lock between processes, which the kernel drops when its holder dies.
-
-    operation: of `fcntl.flock`. Raises BlockingIOError where LOCK_NB asks for that.
-    """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(descriptor, operation)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 class _Locator(UserProvidedCacheLocator):
@@ -115,13 +56,13 @@ class _Locator(UserProvidedCacheLocator):
 
     def get_cache_path(self) -> str:
         source = Path(self._py_file).resolve()
-        if not source.is_relative_to(_PACKAGE):
+        if not source.is_relative_to(PACKAGE):
             return str(super().get_cache_path())  # type: ignore[no-untyped-call]
-        return str(CACHE_FOLDER / ".".join(source.relative_to(_PACKAGE).parts[:-1]))
+        return str(CACHE_FOLDER / ".".join(source.relative_to(PACKAGE).parts[:-1]))
 
 
 class _CacheImpl(CompileResultCacheImpl):
-    _locator_classes = (_Locator,)
+    _locator_classes: ClassVar[list[type[object]]] = [_Locator]
 
 
 class _SharedCache(FunctionCache):

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines import nerf
-from pipelines.nerf.engines.cpu.parts import runtime
+from pipelines.nerf.engines.cpu.parts import kernel_cache, runtime
 
 
 def _half(values: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -34,7 +34,7 @@ _compiled_half = runtime.compiled(_half)
 
 
 def _saved(name: str) -> list[Path]:
-    return list(runtime.CACHE_FOLDER.rglob(f"test_runtime.{name}-*.nbi"))
+    return list(kernel_cache.CACHE_FOLDER.rglob(f"test_runtime.{name}-*.nbi"))
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_processes_take_turns_at_saving_and_loading(nothing_saved: None) -> None
     # As another process would: locks belong to open files, not to processes.
     mine = runtime.compiled(_half)
     with ThreadPoolExecutor(1) as pool:
-        with runtime.file_lock(runtime.CACHE_FOLDER / "lock", fcntl.LOCK_EX):
+        with kernel_cache.file_lock(kernel_cache.CACHE_FOLDER / "lock", fcntl.LOCK_EX):
             waiting = pool.submit(mine, 3.0)
             with pytest.raises(TimeoutError):
                 waiting.result(timeout=1.0)
@@ -92,17 +92,17 @@ def test_kernels_are_compiled_anew_when_a_constant_in_them_changes(
     shutil.copytree(
         Path(nerf.__file__).parent, copied, ignore=shutil.ignore_patterns("__pycache__")
     )
-    version = runtime.kernel_version(copied)
-    assert runtime.CACHE_FOLDER.name == f"kernels-{version}"
+    version = kernel_cache.kernel_version(copied)
+    assert kernel_cache.CACHE_FOLDER.name == f"kernels-{version}"
     text = (copied / source).read_text("utf-8")
     assert constant in text
     (copied / source).write_text(text.replace(constant, f"# changed\n{constant}", 1), "utf-8")
-    assert runtime.kernel_version(copied) != version
+    assert kernel_cache.kernel_version(copied) != version
     (copied / source).write_text(text, "utf-8")
-    assert runtime.kernel_version(copied) == version
+    assert kernel_cache.kernel_version(copied) == version
     # What no kernel is made of may change without compiling anything.
     (copied / "judging" / "metrics.py").write_text("", "utf-8")
-    assert runtime.kernel_version(copied) == version
+    assert kernel_cache.kernel_version(copied) == version
 
 
 def test_what_one_copy_of_the_sources_has_compiled_serves_another(tmp_path: Path) -> None:
@@ -134,12 +134,12 @@ def test_what_one_copy_of_the_sources_has_compiled_serves_another(tmp_path: Path
 def test_a_lock_that_is_held_can_be_refused(tmp_path: Path) -> None:
     exclusive = fcntl.LOCK_EX | fcntl.LOCK_NB
     with (
-        runtime.file_lock(tmp_path / "lock", exclusive),
+        kernel_cache.file_lock(tmp_path / "lock", exclusive),
         pytest.raises(BlockingIOError),
-        runtime.file_lock(tmp_path / "lock", exclusive),
+        kernel_cache.file_lock(tmp_path / "lock", exclusive),
     ):
         raise AssertionError("both hold it")
-    with runtime.file_lock(tmp_path / "lock", exclusive):
+    with kernel_cache.file_lock(tmp_path / "lock", exclusive):
         return
 
 

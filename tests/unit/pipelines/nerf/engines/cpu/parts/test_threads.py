@@ -20,13 +20,13 @@ pytestmark = pytest.mark.skipif(
 _LIBRARIES = """
 import json, os, re, sys
 import numba
-from pipelines.nerf import compiling as warm
+from pipelines.nerf import compiling as warm, made_jobs
 from pipelines.options import resolve_options, stage_options, train_config
 import pipelines.stages.train
 
 config = train_config(stage_options("train", resolve_options("preview", {})["train"]))
 for part in warm.PARTS:
-    warm.run_part(part, config)
+    made_jobs.run_part(part, config)
 try:
     layer = numba.threading_layer()
 except ValueError:
