@@ -23,7 +23,12 @@ SMALL: dict[str, Any] = {
         "model": {"grid": {"log2_table_size": 15, "max_res": 256}},
     },
     "pointcloud": {"num_points": 20_000},
-    "mesh": {"resolution": 96, "num_views": 30, "render_long_side_px": 160},
+    "mesh": {
+        "resolution": 96,
+        "num_views": 16,
+        "render_long_side_px": 128,
+        "texture_px": 1024,
+    },
     "video": {"num_frames": 16, "long_side_px": 160},
 }
 
