@@ -38,16 +38,20 @@ __all__ = [
 ]
 
 
+RUN_NO_JOB = {"test_chaos.py", "test_launcher.py"}
+"""Files of e2e that start services and wait for them, but run no job to its end that computes."""
+
+
 class Scheduling(LoadFileScheduling):  # type: ignore[misc]
-    """Tests of a file share a process, for its fixtures; so do all of e2e.
+    """Tests of a file share a process, for its fixtures; so do all of e2e that run jobs.
 
     Those share a film and compiled kernels, and a job uses every core: two at once would only be in
     each other's way.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        file: str = super()._split_scope(nodeid)
-        return "e2e" if "e2e" in Path(file).parts else file
+        file = Path(super()._split_scope(nodeid))
+        return "jobs" if "e2e" in file.parts and file.name not in RUN_NO_JOB else str(file)
 
 
 @pytest.hookimpl(optionalhook=True)
