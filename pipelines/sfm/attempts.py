@@ -379,11 +379,11 @@ class Ladder:
             )
 
         mapping = mapped_by(self._lenses)
-        if lens_ran_away(mapping.models, len(keys) or num):
-            self._ctx.logger.info("the distortion ran away: mapping without any")
+        if self._may_bend and lens_ran_away(mapping.models, len(keys) or num):
+            self._ctx.logger.info("few are placed, and the lens bends too much: mapping without")
             unbent = replace(settings, refine_distortion=False)
             held = mapped_by(self._lenses, unbent)
-            if held.num_placed > mapping.num_placed:
+            if self._is_better(held, mapping):
                 mapping, settings = held, unbent
                 mapped_by = partial(mapped_by, settings=unbent)
         settled: Settled = "known"
@@ -442,6 +442,23 @@ class Ladder:
             [len(model.indices) for model in models],
             [None if model.agreement is None else round(model.agreement, 3) for model in models],
         )
+
+    @property
+    def _may_bend(self) -> bool:
+        """Whether the lens is ours to choose, and one that bends."""
+        return self._options.camera_model == AUTO and not self._source.has_panoramas
+
+    def _is_better(self, tried: Mapping, mapping: Mapping) -> bool:
+        """Whether its best model holds more images, as far as matches do not contradict it."""
+        seen = self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES)
+        weights = [
+            max(
+                (replace(m, agreement=agreement_of_model(m, seen)).weight for m in one.models),
+                default=0.0,
+            )
+            for one in (tried, mapping)
+        ]
+        return weights[0] > weights[1]
 
     def _trials(self, mapping: Mapping, model: SparseModel) -> LensTrials:
         return mapping.reconstructor.lens_trials(

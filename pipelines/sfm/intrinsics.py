@@ -7,6 +7,8 @@ A richer one is taken where it lowers their mean squared error
 
 - by more than `MIN_SIGMAS` standard errors. Errors within an image belong together, so images
   count, not observations; and
+- not by running away: where a term is beyond `MOST_BENT` and takes the focal length along, it is
+  no lens; and
 - by more than `MIN_GAIN`, or by more than `BENT_GAIN` where a focal length moves by more than
   `MAX_MOVE`. Rolling shutter and moving things are soaked up by additional terms, too, and where a
   capture says little of the focal length those bend it (docs/poses.md): that takes more evidence.
@@ -56,8 +58,8 @@ WEAK_PERCENT = 10.0
 """Uncertainty of the focal length from which it is called weak: well filmed captures have 1 to 2,
 one whose rays differ by 6 degrees 4 to 5 (docs/poses-experiments.md)."""
 
-_MOST_BENT = 1.0
-"""Distortion from which COLMAP takes images out of a model."""
+MOST_BENT = 1.0
+"""Term of a distortion from which COLMAP takes images out of a model."""
 _FEW_PLACED = 0.8
 """Share of the images below which a model lacks many."""
 
@@ -147,11 +149,16 @@ def lens_ran_away(models: Sequence[SparseModel], num_images: int) -> bool:
     """Whether models of so many images hold few of them, as a lens bends beyond what any does.
 
     What is flat and far says next to nothing of focal length and distortion: both grow until COLMAP
-    takes the images out again. A model without distortion holds them all.
+    takes the images out again. A model without distortion holds them all. A piece of few images is
+    bent often, and says nothing where others are not.
     """
     held = max((len(model.indices) for model in models), default=0)
-    is_bent = any(abs(camera.k1) > _MOST_BENT for model in models for camera in model.cameras)
-    return held < _FEW_PLACED * num_images and (is_bent or not models)
+    bent = [any(abs(lens.k1) > MOST_BENT for lens in model.cameras) for model in models]
+    num_bent = sum(
+        len(model.indices) for model, is_bent in zip(models, bent, strict=True) if is_bent
+    )
+    num_plain = sum(len(model.indices) for model in models) - num_bent
+    return held < _FEW_PLACED * num_images and num_bent >= num_plain
 
 
 def unsettled(model: SparseModel) -> tuple[LensVerdict, ...]:
@@ -265,6 +272,8 @@ def _earns(before: Fit, after: Fit, trials: LensTrials, camera: int) -> bool:
     """Whether the evidence is for `after`, the richer one."""
     was = before.focal_px[camera]
     moved = max(abs(focal / was - 1.0) for focal in after.focal_xy_px[camera])
+    if moved > MAX_MOVE and after.most_bent[camera] > MOST_BENT:
+        return False
     wanted = MIN_GAIN if moved <= MAX_MOVE else BENT_GAIN
     return _gain(before, after, trials, camera).exceeds(wanted)
 
@@ -347,6 +356,7 @@ def _verdict_of(
             if not _gain(fit, best, trials, camera).exceeds(BENT_GAIN)
         ]
         spread = max([spread, *(abs(rival - focal) / focal for rival in rivals)])
+        spread = min(spread, _MAX_SPREAD)
     return LensVerdict(
         num_images=trials.num_views[camera],
         lens=best.lenses[camera],

@@ -43,12 +43,6 @@ class Mapping:
     left_out: PairSet = frozenset()
     sides: Sides = ()
 
-    @property
-    def num_placed(self) -> int:
-        """Images in the best model."""
-        best = best_model(self.models)
-        return 0 if best is None else len(best.indices)
-
 
 def mended(
     reconstructor: Reconstructor,

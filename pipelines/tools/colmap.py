@@ -69,9 +69,9 @@ Watch = Callable[[int], None]
 _POLL_S = 0.5
 _IMAGE_PORTION = 8
 _MOST_TIMES, _FEW = 5, 40
-"""How often mapping may place each image, on the average (models that overlap hold some again), as
-if there were so many more. Where a lens runs away, COLMAP begins up to 200 models that all fall to
-pieces."""
+"""How often mapping may place each image, on the average, as if there were so many more; twice as
+often where models may overlap as far as they lead, as ten may hold all. Where a lens runs away,
+COLMAP begins up to 200 models that all fall to pieces."""
 _PAIR_TILE = 12
 """Pairs are taken in tiles of 12 x 12 images, whose features then stay in memory."""
 _PAIR_PORTION = 72
@@ -260,7 +260,8 @@ class Reconstructor:
         output = Path(tempfile.mkdtemp(prefix="models-", dir=self.scratch))
         options = mapping_options(settings, self.num_threads, self.seed)
         options.image_names = [self.names[index] for index in only]
-        most = _MOST_TIMES * ((len(only) or len(self.names)) + _FEW)
+        times = _MOST_TIMES * (2 if settings.thorough else 1)
+        most = times * ((len(only) or len(self.names)) + _FEW)
         placed = 0
 
         def mapped(token: Any) -> Any:

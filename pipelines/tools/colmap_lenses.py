@@ -50,12 +50,14 @@ digits."""
 class Fit:
     """A trial's result.
 
-    lenses, focal_xy_px: by camera id. errors_px: [H], infinite behind the camera. reconstruction:
+    lenses, focal_xy_px: by camera id. most_bent: the largest term of each one's distortion; 0 of a
+    fisheye, which bends by what it is. errors_px: [H], infinite behind the camera. reconstruction:
     pycolmap's, of the tracks that were fitted.
     """
 
     lenses: dict[int, str]
     focal_xy_px: dict[int, tuple[float, float]]
+    most_bent: dict[int, float]
     errors_px: Floats
     reconstruction: Any
 
@@ -160,6 +162,12 @@ class LensTrials:
             lenses=dict(lenses),
             focal_xy_px={
                 i: (float(camera.focal_length_x), float(camera.focal_length_y))
+                for i, camera in cameras.items()
+            },
+            most_bent={
+                i: 0.0
+                if "FISHEYE" in lenses[i]
+                else max((abs(camera.params[k]) for k in camera.extra_params_idxs()), default=0.0)
                 for i, camera in cameras.items()
             },
             errors_px=self._errors(fitted),

@@ -53,7 +53,7 @@ def stage_environment(
 
 
 def kernel_folder(environment: Mapping[str, str]) -> Path:
-    """Where compiled kernels are kept: as pipelines/nerf/engines/cpu/parts/runtime.py has it."""
+    """Where compiled kernels are kept, as pipelines/nerf/engines/cpu/parts/kernel_cache.py says."""
     if chosen := environment.get("NUMBA_CACHE_DIR"):
         return Path(chosen).absolute()
     if home := environment.get("NERFWORKS_HOME"):

@@ -59,7 +59,8 @@ def render(pose: np.ndarray) -> Image.Image:
 def picked(texture: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The texture, repeated by mirroring, at fractional positions."""
     colors = np.empty((len(a), 3))
-    _pick(texture, a, b, colors)
+    # One layout, so one compiled function: processes that save two at once could mix them up.
+    _pick(texture, np.ascontiguousarray(a), np.ascontiguousarray(b), colors)
     return colors
 
 

@@ -29,7 +29,12 @@ from numba.core.caching import (
     UserProvidedCacheLocator,
 )
 
-from pipelines.nerf.engines.cpu.parts.kernel_cache import CACHE_FOLDER, PACKAGE, file_lock
+from pipelines.nerf.engines.cpu.parts.kernel_cache import (
+    CACHE_FOLDER,
+    PACKAGE,
+    file_lock,
+    kernel_version,
+)
 
 SHARES_PER_THREAD = 8
 
@@ -53,6 +58,13 @@ class _Locator(UserProvidedCacheLocator):
     copy of them. By numba's own names a second copy would find none of it, though the marks say
     that all is compiled (`pipelines.nerf.compiling`).
     """
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        """As numba has it, though its setting may be empty: numba reads its settings anew where a
+        variable NUMBA_... has changed."""
+        numba.config.CACHE_DIR = str(CACHE_FOLDER)  # type: ignore[attr-defined]
+        return super().from_function(py_func, py_file)  # type: ignore[no-untyped-call]
 
     def get_cache_path(self) -> str:
         source = Path(self._py_file).resolve()
@@ -80,6 +92,8 @@ class _SharedCache(FunctionCache):
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
     def save_overload(self, sig: Any, data: Any) -> None:
+        if CACHE_FOLDER.name != f"kernels-{kernel_version(PACKAGE)}":
+            return  # the sources have changed since this process began: of which is this?
         with file_lock(CACHE_FOLDER / "lock", fcntl.LOCK_EX):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
@@ -115,7 +129,7 @@ event.register("numba:compile", _watch)  # type: ignore[no-untyped-call]
 
 def compile_seconds() -> float:
     """Seconds that this process spent on compiling so far, or waited for others that compiled for
-    it (`warm`); 0 where all came from the cache."""
+    it; 0 where all came from the cache."""
     return _watch.seconds
 
 
