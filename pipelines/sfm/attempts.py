@@ -379,8 +379,8 @@ class Ladder:
             )
 
         mapping = mapped_by(self._lenses)
-        if self._may_bend and lens_ran_away(mapping.models, len(keys) or num):
-            self._ctx.logger.info("few are placed, and the lens bends too much: mapping without")
+        if self._may_bend and lens_ran_away(mapping.models):
+            self._ctx.logger.info("the lens bends too much, or nothing is placed: mapping without")
             unbent = replace(settings, refine_distortion=False)
             held = mapped_by(self._lenses, unbent)
             if self._is_better(held, mapping):

@@ -60,8 +60,6 @@ one whose rays differ by 6 degrees 4 to 5 (docs/poses-experiments.md)."""
 
 MOST_BENT = 1.0
 """Term of a distortion from which COLMAP takes images out of a model."""
-_FEW_PLACED = 0.8
-"""Share of the images below which a model lacks many."""
 
 _CAP = 5.0
 """Errors count up to so many medians: a wrong match says nothing of the lens."""
@@ -145,20 +143,21 @@ def mapping_lens(wanted: str) -> str:
     return LENSES[0] if wanted == AUTO else wanted
 
 
-def lens_ran_away(models: Sequence[SparseModel], num_images: int) -> bool:
-    """Whether models of so many images hold few of them, as a lens bends beyond what any does.
+def lens_ran_away(models: Sequence[SparseModel]) -> bool:
+    """Whether most of what models hold is of a lens that bends beyond what any does, or there is
+    none.
 
     What is flat and far says next to nothing of focal length and distortion: both grow until COLMAP
     takes the images out again. A model without distortion holds them all. A piece of few images is
     bent often, and says nothing where others are not.
     """
-    held = max((len(model.indices) for model in models), default=0)
-    bent = [any(abs(lens.k1) > MOST_BENT for lens in model.cameras) for model in models]
-    num_bent = sum(
-        len(model.indices) for model, is_bent in zip(models, bent, strict=True) if is_bent
-    )
-    num_plain = sum(len(model.indices) for model in models) - num_bent
-    return held < _FEW_PLACED * num_images and num_bent >= num_plain
+    num_bent = num_plain = 0
+    for model in models:
+        if any(abs(lens.k1) > MOST_BENT for lens in model.cameras):
+            num_bent += len(model.indices)
+        else:
+            num_plain += len(model.indices)
+    return num_bent >= num_plain
 
 
 def unsettled(model: SparseModel) -> tuple[LensVerdict, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,9 +69,10 @@ def test_cut_outs_of_a_flat_thing_far_away_are_all_placed(
     out.mkdir()
     workspace = Workspace(tmp_path)
     ctx = StageContext("poses", workspace, out, workspace.checkpoint("poses"))
+    options = PosesOptions(num_features=800, max_image_px=400, upsample="off", num_threads=1)
     with caplog.at_level(logging.INFO):
-        run(PosesOptions(num_features=800, max_image_px=400, upsample="off"), ctx)
-    assert "the lens bends too much: mapping without" in caplog.text, "else this shows nothing"
+        run(options, ctx)
+    assert "the lens bends too much, or nothing is placed" in caplog.text, "else this shows nothing"
     report = json.loads((out / "report.json").read_text("utf-8"))
     assert [attempt["rung"] for attempt in report["attempts"]] == ["quick"]
     found = CamerasFile.load(out / "cameras.json")
@@ -82,18 +84,16 @@ def test_cut_outs_of_a_flat_thing_far_away_are_all_placed(
     assert "focal_length_weak" in [warning["code"] for warning in report["warnings"]]
 
 
-def test_a_lens_ran_away_where_few_are_placed_and_it_bends_more_than_any_does() -> None:
+def test_a_lens_ran_away_where_most_is_bent_more_than_any_lens_does() -> None:
     bent = Intrinsics(400, 300, 9000.0, 9000.0, 200.0, 150.0, k1=-3.0)
     poses = true_poses(10)
     plain = model_of(poses[:2], (0, 1))
-    odd = model_of(poses[:2], (5, 6))
-    odd = type(odd)(**{**vars(odd), "cameras": (bent,)})
-    assert lens_ran_away([plain, odd], 10)
-    assert lens_ran_away([], 10)
-    assert not lens_ran_away([plain], 10), "other things are missing"
-    assert not lens_ran_away([odd, model_of(poses[:8], tuple(range(8)))], 10), "most are placed"
+    odd = replace(model_of(poses[:2], (5, 6)), cameras=(bent,))
+    assert lens_ran_away([plain, odd])
+    assert lens_ran_away([])
+    assert not lens_ran_away([plain])
     pieces = [odd, model_of(poses[:5], tuple(range(5)))]
-    assert not lens_ran_away(pieces, 10), "a bent piece of two beside five that are not"
+    assert not lens_ran_away(pieces), "a bent piece of two beside five that are not"
 
 
 def nothing(_done: int) -> None:
