@@ -24,7 +24,8 @@ from pipelines.sfm.agreement import (
     contradicted_images,
 )
 from pipelines.sfm.checkpoint import Checkpoint
-from pipelines.sfm.intrinsics import AUTO, FISHEYE, lens_ran_away, mapping_lens
+from pipelines.sfm.held_lens import held_where_it_ran_away
+from pipelines.sfm.intrinsics import AUTO, FISHEYE, mapping_lens
 from pipelines.sfm.key_frames import (
     clips_of_keys,
     first_keys,
@@ -379,13 +380,15 @@ class Ladder:
             )
 
         mapping = mapped_by(self._lenses)
-        if self._may_bend and lens_ran_away(mapping.models):
-            self._ctx.logger.info("the lens bends too much, or nothing is placed: mapping without")
-            unbent = replace(settings, refine_distortion=False)
-            held = mapped_by(self._lenses, unbent)
-            if self._is_better(held, mapping):
-                mapping, settings = held, unbent
-                mapped_by = partial(mapped_by, settings=unbent)
+        if self._is_lens_ours:
+            mapping, settings = held_where_it_ran_away(
+                mapping,
+                settings,
+                partial(mapped_by, self._lenses),
+                lambda: self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES),
+                self._ctx.logger,
+            )
+            mapped_by = partial(mapped_by, settings=settings)
         settled: Settled = "known"
         alike = unknown_lenses(self._source, self._options.camera_model)
         if alike:
@@ -444,21 +447,9 @@ class Ladder:
         )
 
     @property
-    def _may_bend(self) -> bool:
+    def _is_lens_ours(self) -> bool:
         """Whether the lens is ours to choose, and one that bends."""
         return self._options.camera_model == AUTO and not self._source.has_panoramas
-
-    def _is_better(self, tried: Mapping, mapping: Mapping) -> bool:
-        """Whether its best model holds more images, as far as matches do not contradict it."""
-        seen = self._reconstructor.verified(MOST_PAIRS, MOST_MATCHES)
-        weights = [
-            max(
-                (replace(m, agreement=agreement_of_model(m, seen)).weight for m in one.models),
-                default=0.0,
-            )
-            for one in (tried, mapping)
-        ]
-        return weights[0] > weights[1]
 
     def _trials(self, mapping: Mapping, model: SparseModel) -> LensTrials:
         return mapping.reconstructor.lens_trials(

@@ -143,23 +143,6 @@ def mapping_lens(wanted: str) -> str:
     return LENSES[0] if wanted == AUTO else wanted
 
 
-def lens_ran_away(models: Sequence[SparseModel]) -> bool:
-    """Whether most of what models hold is of a lens that bends beyond what any does, or there is
-    none.
-
-    What is flat and far says next to nothing of focal length and distortion: both grow until COLMAP
-    takes the images out again. A model without distortion holds them all. A piece of few images is
-    bent often, and says nothing where others are not.
-    """
-    num_bent = num_plain = 0
-    for model in models:
-        if any(abs(lens.k1) > MOST_BENT for lens in model.cameras):
-            num_bent += len(model.indices)
-        else:
-            num_plain += len(model.indices)
-    return num_bent >= num_plain
-
-
 def unsettled(model: SparseModel) -> tuple[LensVerdict, ...]:
     """What is said of the lenses of a model with panoramas, which are left as they were mapped."""
     counts = [model.camera_of.count(camera) for camera in range(len(model.cameras))]

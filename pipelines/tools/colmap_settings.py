@@ -118,6 +118,7 @@ def mapping_options(settings: MapperSettings, num_threads: int, seed: int) -> An
     options.min_model_size = 3
     options.max_num_models = 10
     options.ba_refine_focal_length = settings.refine_focal
+    options.mapper.abs_pose_refine_focal_length = settings.refine_focal
     options.ba_refine_extra_params = settings.refine_distortion
     options.mapper.abs_pose_refine_extra_params = settings.refine_distortion
     options.ba_refine_principal_point = settings.refine_principal_point
