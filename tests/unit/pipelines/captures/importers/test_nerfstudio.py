@@ -497,5 +497,4 @@ def test_times_of_a_moving_scene_are_told_and_clocks_are_not(tmp_path: Path) -> 
     frames = [
         {"timestamp" if key == "time" else key: frame[key] for key in frame} for frame in frames
     ]
-    summary, _ = ingest(tmp_path / "b", nerfstudio_files(4, frames=frames))
-    assert summary["warnings"] == []
+    assert ingest(tmp_path / "b", nerfstudio_files(4, frames=frames))[0]["warnings"] == []
