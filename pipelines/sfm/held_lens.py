@@ -43,7 +43,8 @@ def held_where_it_ran_away(
             "" if tried.refine_focal else ", by the focal length that it starts from",
         )
         held = mapped_by(tried)
-        if _weight(held, seen()) > _weight(mapping, seen()):
+        matches = seen()
+        if _weight(held, matches) > _weight(mapping, matches):
             mapping, settings = held, tried
     return mapping, settings
 

@@ -7,11 +7,12 @@ A richer one is taken where it lowers their mean squared error
 
 - by more than `MIN_SIGMAS` standard errors. Errors within an image belong together, so images
   count, not observations; and
-- not by running away: where a term is beyond `MOST_BENT` and takes the focal length along, it is
-  no lens; and
 - by more than `MIN_GAIN`, or by more than `BENT_GAIN` where a focal length moves by more than
   `MAX_MOVE`. Rolling shutter and moving things are soaked up by additional terms, too, and where a
   capture says little of the focal length those bend it (docs/poses.md): that takes more evidence.
+
+One that bends by a term beyond `MOST_BENT`, and takes the focal length along, is no lens, whatever
+it fits.
 
 The simplest model within the noise of the best is the rule of Breiman, Friedman, Olshen and Stone,
 "Classification and Regression Trees", 1984, 3.4.3, with the standard error of the paired
