@@ -55,11 +55,14 @@ class StepPlan:
     step: counted from 0. exponent: the power of proposal weights before resampling; a tensor on the
         device where the step is captured, so that it can differ from run to run.
     update_proposals: whether the sampler's own networks learn in this step.
+    samples: where the step's rays are to be asked, in place of the sampler's choice; only of
+        methods that take them (`Model.takes_samples`). No term of the loss reads their `s_edges`.
     """
 
     step: int
     exponent: float | Tensor = 1.0
     update_proposals: bool = True
+    samples: RaySamples | None = None
 
 
 class Model(nn.Module, ABC):
@@ -80,6 +83,8 @@ class Model(nn.Module, ABC):
         )
 
     config: ModelConfig
+    takes_samples = False
+    """Whether `StepPlan.samples` is heeded."""
     method = ""
     """The name in `train.method`."""
 

@@ -33,7 +33,7 @@ from pipelines.nerf.networks.encodings import HashGrid, hash_encode
 from pipelines.nerf.networks.fields import DensityField, NerfactoField
 from pipelines.nerf.networks.normals import PredictedNormals, normals_of_logits
 from pipelines.nerf.options.methods.nerfacto import NerfactoConfig
-from pipelines.nerf.space.rays import Rays
+from pipelines.nerf.space.rays import Rays, RaySamples
 
 ALWAYS_UPDATE_BEFORE = 10
 
@@ -43,6 +43,7 @@ class Nerfacto(Model):
 
     config: NerfactoConfig
     method = "nerfacto"
+    takes_samples = True
 
     def __init__(self, config: NerfactoConfig, num_train_images: int) -> None:
         super().__init__(config, num_train_images)
@@ -121,21 +122,10 @@ class Nerfacto(Model):
         rays = self.corrected(rays)
         plan = plan or StepPlan(0)
         kernels = self._kernels(rays.origins)
-        with nullcontext() if plan.update_proposals else torch.no_grad():
-            final, samples, weights = sample_proposals(
-                rays,
-                self.round_networks(),
-                config.num_proposal_samples,
-                config.num_nerf_samples,
-                config.near,
-                config.far,
-                spacing=config.spacing,
-                exponent=plan.exponent,
-                single_jitter=config.single_jitter,
-                generator=generator,
-                weigh=kernels.weigh if kernels else weigh_density,
-                resample=kernels.resample if kernels else sample_pdf,
-            )
+        if plan.samples is None:
+            final, samples, weights = self._propose(rays, plan, generator, kernels)
+        else:
+            final, samples, weights = plan.samples, [], []
         codes = self._codes(rays, appearance, generator)
         if kernels and kernels.knows_field(self.field):
             rgb, found = kernels.shade(self.field, rays, final, codes, config.background, generator)
@@ -158,6 +148,27 @@ class Nerfacto(Model):
         if self.normal_head is not None:
             self._add_normals(outputs, rays, self.normal_head)
         return outputs
+
+    def _propose(
+        self, rays: Rays, plan: StepPlan, generator: torch.Generator | None, kernels: Any
+    ) -> tuple[RaySamples, list[RaySamples], list[Tensor]]:
+        """As `samplers.sample_proposals`."""
+        config = self.config
+        with nullcontext() if plan.update_proposals else torch.no_grad():
+            return sample_proposals(
+                rays,
+                self.round_networks(),
+                config.num_proposal_samples,
+                config.num_nerf_samples,
+                config.near,
+                config.far,
+                spacing=config.spacing,
+                exponent=plan.exponent,
+                single_jitter=config.single_jitter,
+                generator=generator,
+                weigh=kernels.weigh if kernels else weigh_density,
+                resample=kernels.resample if kernels else sample_pdf,
+            )
 
     def _add_normals(self, outputs: Outputs, rays: Rays, head: PredictedNormals) -> None:
         """Normals from density and predicted ones, per sample for the losses and per ray.
@@ -188,19 +199,22 @@ class Nerfacto(Model):
     def loss_dict(
         self, outputs: Outputs, truth: Tensor, *, plan: StepPlan | None = None
     ) -> dict[str, Tensor]:
-        """As `Model.loss_dict`; no interlevel term where the proposals have no graph."""
+        """As `Model.loss_dict`; no interlevel term where the proposals have no graph, and none of
+        the spread along the ray where the plan said where to look."""
         config = self.config
         *proposal_weights, weights = outputs["weights"]
         *proposal_samples, final = outputs["samples"]
         losses = {"rgb": color_loss(outputs["rgb"], truth)}
-        if (plan is None or plan.update_proposals) and config.interlevel_weight > 0.0:
+        placed = plan is not None and plan.samples is not None
+        learns = plan is None or plan.update_proposals
+        if not placed and learns and config.interlevel_weight > 0.0:
             edges = [samples.s_edges for samples in proposal_samples]
             pairs = list(zip(edges, proposal_weights, strict=True))
             kernels = self._kernels(weights)
             loss = kernels.interlevel_loss if kernels else interlevel_loss
             interlevel = loss(final.s_edges, weights, pairs)
             losses["interlevel"] = config.interlevel_weight * interlevel
-        if config.distortion_weight > 0.0:
+        if not placed and config.distortion_weight > 0.0:
             distortion = distortion_loss(final.s_edges, weights)
             losses["distortion"] = config.distortion_weight * distortion
         if self.normal_head is not None:

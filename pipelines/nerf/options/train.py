@@ -99,6 +99,31 @@ class DepthLossConfig:
 
 
 @dataclass(frozen=True)
+class GuidedConfig:
+    """Steps whose samples lie where depth maps say that something stands, and a few before it.
+
+    Such a ray costs a fraction of one that has to look for its surface, so that many more are seen
+    in the same time. See `along_ray.guided`. For nerfacto; a GPU's captured steps take none.
+    """
+
+    share: float = option(
+        0.0, "Share of the steps that are so, evenly among the others; 0 for none.", ge=0.0, le=0.9
+    )
+    rays_per_step: int = option(
+        3072, "Rays drawn for such a step: those count whose depth is known.", ge=1, le=2**20
+    )
+    num_free_samples: int = option(3, "Samples before the surface.", ge=1, le=256)
+    num_near_samples: int = option(5, "Samples around the surface.", ge=1, le=256)
+    spread: float = option(
+        0.1,
+        "How far around the map's depth these lie at first, each way, relative.",
+        ge=1e-3,
+        le=0.9,
+    )
+    spread_final: float = option(0.02, "The same at the end of the run.", ge=1e-3, le=0.9)
+
+
+@dataclass(frozen=True)
 class FlatLossConfig:
     """Plain surfaces have no bumps: lines of evenly coloured pixels as one more thing to fit.
 
@@ -207,6 +232,9 @@ class TrainConfig:
     data: DataConfig = field(default_factory=DataConfig, metadata={"help": "The data's options."})
     depth: DepthLossConfig = field(
         default_factory=DepthLossConfig, metadata={"help": "What depth maps are used for."}
+    )
+    guided: GuidedConfig = field(
+        default_factory=GuidedConfig, metadata={"help": "Steps that know where to look."}
     )
     flat: FlatLossConfig = field(
         default_factory=FlatLossConfig, metadata={"help": "How plain surfaces are kept from bumps."}

@@ -32,6 +32,7 @@ from pipelines.nerf.options.train import TrainConfig, validate
 from pipelines.nerf.space.cameras import Cameras
 from pipelines.nerf.training.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.nerf.training.gpu_steps import EngineLost, GpuSteps, StepShape
+from pipelines.nerf.training.guided_steps import GuidedSteps
 from pipelines.nerf.training.state import (
     TrainingState,
     initial_state,
@@ -113,6 +114,7 @@ def train(
     posed = posed.to(device)
     state.model.train()
     graphs = _gpu_steps(state, sampler, posed, config, supervision)
+    guided = GuidedSteps.of(config, state.model, supervision)
     preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
     step_times: deque[float] = deque(maxlen=TIMED_STEPS)
     step_rays: deque[int] = deque(maxlen=TIMED_STEPS)
@@ -133,7 +135,14 @@ def train(
                 _require_learning(losses)
             else:
                 losses = optimise_once(
-                    state, sampler, posed, config, shape, depth=supervision, check=is_reported
+                    state,
+                    sampler,
+                    posed,
+                    config,
+                    shape,
+                    depth=supervision,
+                    guided=guided,
+                    check=is_reported,
                 )
         except EngineLost:
             graphs = None
@@ -207,11 +216,13 @@ def optimise_once(
     shape: StepShape,
     *,
     depth: DepthSupervision | None = None,
+    guided: GuidedSteps | None = None,
     check: bool,
 ) -> StepLosses | None:
     """One step: pixels -> rays -> model -> losses -> Adam.
 
-    check: read the losses, which waits for the GPU; None unread.
+    guided: which steps are told where to look. check: read the losses, which waits for the GPU;
+    None unread.
     """
     model = state.model
     device = cameras.focal.device
@@ -222,19 +233,26 @@ def optimise_once(
     plan = model.plan_step(state.step, state.model_random)
 
     sampler.block = shape.block
-    drawn = sampler.draw_batch(shape.num_rays, state.pixel_random)
-    index, pixels, colors, plain = (item.to(device) for item in drawn)
-    rays = cameras.generate_rays(index, pixels)
+    known = None
+    if guided is not None and guided.is_due(state.step):
+        known = guided.batch(state, plan, sampler, cameras)
+    lines = sampler.lines if known is None else None
+    if known is not None:
+        plan, rays, colors = known
+    else:
+        drawn = sampler.draw_batch(shape.num_rays, state.pixel_random)
+        index, pixels, colors, plain = (item.to(device) for item in drawn)
+        rays = cameras.generate_rays(index, pixels)
     with torch.autocast(device.type, dtype=torch.float16, enabled=device.type == "cuda"):
         outputs = model(rays, plan=plan, generator=state.model_random)
         losses = model.loss_dict(outputs, colors, plan=plan)
     if depth is not None:
         term = depth.loss(outputs, rays, cameras, *depth.schedule(state.step))
         losses = losses if term is None else {**losses, "depth": term}
-    if sampler.lines is not None:
-        weight = sampler.lines.weight(state.step)
+    if lines is not None:
+        weight = lines.weight(state.step)
         maps = None if depth is None else depth.maps
-        term = sampler.lines.loss(outputs, rays, cameras, plain, weight, maps)
+        term = lines.loss(outputs, rays, cameras, plain, weight, maps)
         losses = losses if term is None else {**losses, "flat": term}
     values = _checked_values(losses, state.step) if check else {}
     scale = state.scaler.get_scale() if check and state.scaler.is_enabled() else None
@@ -248,7 +266,8 @@ def optimise_once(
     state.scaler.update()
 
     state.step += 1
-    model.finish_step(plan)
+    if known is None:  # the sampler's own networks count the steps that ask them
+        model.finish_step(plan)
     return StepLosses(state.step - 1, values, scale) if check else None
 
 
