@@ -107,20 +107,26 @@ class GuidedConfig:
     """
 
     share: float = option(
-        0.0, "Share of the steps that are so, evenly among the others; 0 for none.", ge=0.0, le=0.9
+        0.0,
+        "Share of the steps that are so, evenly among the others; 0 for none.",
+        ge=0.0,
+        le=0.9,
+    )
+    until: float = option(
+        0.6, "Share of the run within which they are; then all look for themselves.", ge=0.0, le=1.0
     )
     rays_per_step: int = option(
-        3072, "Rays drawn for such a step: those count whose depth is known.", ge=1, le=2**20
+        4096, "Rays drawn for such a step: those count whose depth is known.", ge=1, le=2**20
     )
-    num_free_samples: int = option(3, "Samples before the surface.", ge=1, le=256)
-    num_near_samples: int = option(5, "Samples around the surface.", ge=1, le=256)
+    num_free_samples: int = option(2, "Samples before the surface.", ge=1, le=256)
+    num_near_samples: int = option(4, "Samples around the surface.", ge=1, le=256)
     spread: float = option(
         0.1,
         "How far around the map's depth these lie at first, each way, relative.",
         ge=1e-3,
         le=0.9,
     )
-    spread_final: float = option(0.02, "The same at the end of the run.", ge=1e-3, le=0.9)
+    spread_final: float = option(0.02, "The same at the end of these steps.", ge=1e-3, le=0.9)
 
 
 @dataclass(frozen=True)

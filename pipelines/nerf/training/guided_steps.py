@@ -43,14 +43,19 @@ class GuidedSteps:
             return None
         return cls(depth, config.guided, config.max_steps, config.model.near)
 
+    @property
+    def _last(self) -> float:
+        """Steps within which they are."""
+        return self.config.until * self.max_steps
+
     def is_due(self, step: int) -> bool:
         """Whether a step is one of them: evenly among the others, the first one never."""
         share = self.config.share
-        return int((step + 1) * share) > int(step * share)
+        return step < self._last and int((step + 1) * share) > int(step * share)
 
     def spread(self, step: int) -> float:
         """How far around the surface samples lie, as a power from first to last."""
-        config, done = self.config, min(step / self.max_steps, 1.0)
+        config, done = self.config, min(step / self._last, 1.0)
         return config.spread * float((config.spread_final / config.spread) ** done)
 
     def batch(

@@ -32,7 +32,7 @@ from tests.unit.pipelines.nerf.toy_scene import (
 )
 
 CPU = torch.device("cpu")
-HALF = GuidedConfig(share=0.5, rays_per_step=512)
+HALF = GuidedConfig(share=0.5, until=1.0, rays_per_step=512, num_free_samples=3, num_near_samples=5)
 
 
 def config_with(guided: GuidedConfig, **changes: object) -> TrainConfig:
@@ -54,6 +54,16 @@ def test_they_are_spread_evenly_and_never_first(share: float) -> None:
     assert sum(due) == int(400 * share)
     assert not due[0]
     assert abs(sum(due[:100]) - 100 * share) <= 1
+
+
+def test_after_a_part_of_the_run_there_are_none() -> None:
+    config = config_with(replace(HALF, until=0.6), max_steps=100)
+    guided = steps_of(config, exact_maps(toy_cameras(6)))
+    assert guided is not None
+    due = [step for step in range(100) if guided.is_due(step)]
+    assert len(due) == 30
+    assert due[-1] == 59
+    assert guided.spread(60) == pytest.approx(0.02)
 
 
 def test_samples_close_in_on_the_surface() -> None:
