@@ -126,17 +126,26 @@ class RedisServer:
             stop(self.process)
 
 
-@pytest.fixture
-def redis_server(tmp_path: Path) -> Iterator[RedisServer]:
+@contextlib.contextmanager
+def running_redis(folder: Path) -> Iterator[RedisServer]:
     """A running Redis with a password."""
     executable = find_redis()
     if executable is None:
         missing("a Redis server")
         raise AssertionError
-    server = RedisServer(executable, tmp_path)
+    server = RedisServer(executable, folder)
     server.start()
-    yield server
-    server.stop()
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+@pytest.fixture
+def redis_server(tmp_path: Path) -> Iterator[RedisServer]:
+    """A Redis of the test's own."""
+    with running_redis(tmp_path) as server:
+        yield server
 
 
 class Gate:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -13,11 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import update
+
 from storage.bell import Bell
-from storage.db import Database
-from storage.jobs import StageSeed, create_job, ready_stage_ids, request_cancel
+from storage.db import Database, now
+from storage.jobs import StageSeed, create_job, ready_stage_ids, request_cancel, stage_id
 from storage.keys import blob_content
-from storage.models import Job, StageRow, new_id
+from storage.models import Job, StageRow, StageRun, new_id
 from storage.objects import ObjectStore
 from storage.open_objects import open_object_store
 from storage.queries import get_job
@@ -81,16 +84,17 @@ class Engine:
         return worker
 
     def close(self) -> None:
-        """End everything."""
-        for worker in self.workers:
-            if worker.poll() is None:
-                worker.send_signal(signal.SIGTERM)
-        for worker in self.workers:
-            try:
-                worker.wait(25)
-            except subprocess.TimeoutExpired:
-                worker.kill()
-                worker.wait()
+        """End everything, at once: that a worker ends by itself is for tests to see."""
+        alive = [worker for worker in self.workers if worker.poll() is None]
+        processes = with_descendants(*(worker.pid for worker in alive))
+        for pid in processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        for worker in alive:
+            worker.wait()
+        deadline = time.monotonic() + 25
+        while any(is_running(pid) for pid in processes) and time.monotonic() < deadline:
+            time.sleep(0.02)
         self.bell.close()
         self.database.dispose()
 
@@ -130,6 +134,15 @@ class Engine:
             self.bell.ring(ready)
         return job.id
 
+    def cut_pause(self, job_id: str, name: str) -> None:
+        """Have a stage that is to be tried again after a pause tried at once."""
+        self.wait(lambda: self.stage(job_id, name).not_before)
+        with self.database.session_scope() as session:
+            until = StageRow.not_before
+            waits = (StageRow.job_id == job_id, StageRow.name == name, until.is_not(None))
+            session.execute(update(StageRow).where(*waits).values(not_before=now(session)))
+        self.bell.ring([stage_id(job_id, name)])
+
     def cancel(self, job_id: str) -> None:
         """Ask a job to stop."""
         with self.database.session_scope() as session:
@@ -144,10 +157,14 @@ class Engine:
         """One stage of a job."""
         return next(row for row in self.job(job_id).stages if row.name == name)
 
+    def runs(self, job_id: str, name: str) -> list[StageRun]:
+        """The claims of one stage, in order."""
+        with self.database.read_scope() as session:
+            return [run for run in list_runs(session, job_id) if run.stage == name]
+
     def outcomes(self, job_id: str, name: str) -> list[str | None]:
         """How the claims of one stage ended, in order."""
-        with self.database.read_scope() as session:
-            return [run.outcome for run in list_runs(session, job_id) if run.stage == name]
+        return [run.outcome for run in self.runs(job_id, name)]
 
     def log(self, job_id: str, stage: str | None = None) -> list[str]:
         """The job's log lines."""
@@ -174,6 +191,22 @@ class Engine:
         """Wait until a job is in one of some states."""
         self.wait(lambda: self.job(job_id).state in states, timeout_s)
         return self.job(job_id)
+
+
+def with_descendants(*pids: int) -> list[int]:
+    """These processes and all that they started, the eldest first."""
+    parents: dict[int, int] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            parents[int(entry.name)] = int(fields[1])
+    found = list(pids)
+    for pid in found:
+        found += [child for child, parent in parents.items() if parent == pid]
+    return found
 
 
 def is_running(pid: int) -> bool:

@@ -14,7 +14,7 @@ import pytest
 
 from storage.records import live_workers
 from tests.histories import check_history
-from tests.integration.engine import Engine
+from tests.integration.engine import Engine, with_descendants
 from tests.integration.toy_stages import STAGES
 from tests.services import RedisServer
 
@@ -30,22 +30,6 @@ def engine_at(folder: Path, redis: RedisServer, **environment: str) -> Iterator[
         yield made
     finally:
         made.close()
-
-
-def with_descendants(*pids: int) -> list[int]:
-    """These processes and all that they started, the eldest first."""
-    parents: dict[int, int] = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue
-            parents[int(entry.name)] = int(fields[1])
-    found = list(pids)
-    for pid in found:
-        found += [child for child, parent in parents.items() if parent == pid]
-    return found
 
 
 @contextmanager
