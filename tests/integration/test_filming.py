@@ -28,7 +28,7 @@ from tests.unit.pipelines.tools.clips import ffmpeg
 RATE, NUM, KEPT = 16, 72, 24
 SMALL = {
     "frames": {"num_frames": KEPT, "candidates_per_frame": 3},
-    "poses": {"num_features": 1200, "max_image_px": 400, "retry_below_ratio": 0.3},
+    "poses": {"num_features": 1200, "max_image_px": 300, "retry_below_ratio": 0.3},
 }
 Pictures = list[np.ndarray]
 
