@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> None:
     runtime.start()
     try:
         # Not `worker_main`: Celery's command line takes half a second of every start to load.
-        make_app(storage).Worker(
+        program = make_app(storage).Worker(
             hostname=f"{chosen.id}@{socket.gethostname()}",
             pool="threads",
             concurrency=slots,
@@ -134,9 +134,11 @@ def main(arguments: list[str] | None = None) -> None:
             without_gossip=True,
             without_mingle=True,
             without_heartbeat=True,
-        ).start()
+        )
+        program.start()
     finally:
         runtime.close()
+    sys.exit(program.exitcode)
 
 
 if __name__ == "__main__":
