@@ -53,6 +53,10 @@ class GuidedSteps:
         share = self.config.share
         return step < self._last and int((step + 1) * share) > int(step * share)
 
+    def num_rays(self, step: int, others: int) -> int:
+        """Rays drawn for a step, of a run whose other steps have so many."""
+        return self.config.rays_per_step if self.is_due(step) else others
+
     def spread(self, step: int) -> float:
         """How far around the surface samples lie, as a power from first to last."""
         config, done = self.config, min(step / self._last, 1.0)

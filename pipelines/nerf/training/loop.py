@@ -114,7 +114,7 @@ def train(
     posed = posed.to(device)
     state.model.train()
     graphs = _gpu_steps(state, sampler, posed, config, supervision)
-    guided = GuidedSteps.of(config, state.model, supervision)
+    guided = None if graphs is not None else GuidedSteps.of(config, state.model, supervision)
     preview_every = config.preview_every_steps or max(1, config.max_steps // PREVIEWS_PER_RUN)
     step_times: deque[float] = deque(maxlen=TIMED_STEPS)
     step_rays: deque[int] = deque(maxlen=TIMED_STEPS)
@@ -129,6 +129,7 @@ def train(
         started = time.monotonic()
         is_reported = device.type == "cpu" or state.step % STEPS_PER_CUDA_REPORT == 0
         shape = begin_step(state, config)
+        num_rays = shape.num_rays if guided is None else guided.num_rays(state.step, shape.num_rays)
         try:
             if graphs is not None:
                 losses = graphs.run(config, shape, check=is_reported)
@@ -152,7 +153,7 @@ def train(
                 save()
             raise
         step_times.append(time.monotonic() - started)
-        step_rays.append(shape.num_rays)
+        step_rays.append(num_rays)
         state.elapsed_s += step_times[-1]
         if losses is not None:
             if wants_checkpoint():
@@ -367,6 +368,8 @@ def _fingerprint(
     free = ("max_steps", "max_seconds", "checkpoint_seconds", "preview_every_steps", "device")
     for name in (*free, "optimizer"):
         del values[name]
+    if config.guided.share == 0.0:  # as of runs from before there were such steps
+        del values["guided"]
     known = 0 if depth is None else depth.maps.num_known
     run = {
         "config": values,

@@ -18,6 +18,7 @@ from pipelines.nerf.models.nerfacto import Nerfacto
 from pipelines.nerf.options.train import DepthLossConfig, GuidedConfig, TrainConfig
 from pipelines.nerf.space.cameras import Cameras
 from pipelines.nerf.space.rays import Rays
+from pipelines.nerf.training.checkpoint import load_checkpoint
 from pipelines.nerf.training.guided_steps import GuidedSteps
 from pipelines.nerf.training.loop import TrainProgress, train
 from pipelines.nerf.training.state import initial_state
@@ -175,6 +176,24 @@ def test_a_short_run_finds_the_surface_sooner_when_half_of_its_steps_know_where_
     (looking, far), (knowing, near) = found
     assert knowing > looking + 0.5
     assert near < 0.6 * far
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_run_without_them_goes_on_from_a_checkpoint_of_before_there_were_any(
+    share: float, tmp_path: Path
+) -> None:
+    """Such a checkpoint names every option of its run, and has no word of these."""
+    cameras, path = toy_cameras(6), tmp_path / "checkpoint.pt"
+    config = config_with(replace(HALF, share=share), max_steps=1)
+    images, maps = toy_images(cameras), exact_maps(cameras)
+    train(images, cameras, range(6), config, seed=0, depth=maps, checkpoint_path=path)
+    assert ("guided" in load_checkpoint(path)["fingerprint"]) == (share > 0.0)
+
+
+def test_progress_counts_the_rays_that_they_draw() -> None:
+    guided = steps_of(config_with(HALF, max_steps=10), exact_maps(toy_cameras(6)))
+    assert guided is not None
+    assert [guided.num_rays(step, 64) for step in range(4)] == [64, 512, 64, 512]
 
 
 def test_a_run_that_was_cut_short_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
