@@ -65,6 +65,12 @@ class DepthMaps:
         """Pixels with a depth, be it infinite."""
         return int((self.z > 0).sum())
 
+    @property
+    def known_share(self) -> float:
+        """Share of the pixels where something is known to stand, and how far away."""
+        found = int((torch.isfinite(self.z) & (self.z > 0)).sum())
+        return found / max(1, len(self.z) - 1)
+
     def to(self, device: torch.device | str) -> DepthMaps:
         """The maps on another device."""
         return DepthMaps(*(item.to(device) for item in vars(self).values()))

@@ -115,6 +115,13 @@ class GuidedConfig:
     until: float = option(
         0.6, "Share of the run within which they are; then all look for themselves.", ge=0.0, le=1.0
     )
+    least_known: float = option(
+        0.5,
+        "Share of the maps' pixels whose depth must be known for there to be any: of fewer such a "
+        "step would tell too little.",
+        ge=0.0,
+        le=1.0,
+    )
     rays_per_step: int = option(
         4096, "Rays drawn for such a step: those count whose depth is known.", ge=1, le=2**20
     )

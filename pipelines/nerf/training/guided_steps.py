@@ -41,6 +41,8 @@ class GuidedSteps:
         """Those of a run; None where its options, method or capture have none."""
         if depth is None or config.guided.share == 0.0 or not model.takes_samples:
             return None
+        if depth.maps.known_share < config.guided.least_known:
+            return None
         return cls(depth, config.guided, config.max_steps, config.model.near)
 
     @property

@@ -105,9 +105,23 @@ def test_there_are_none_without_maps_share_or_a_method_that_takes_them() -> None
     assert GuidedSteps.of(config, model, told) is None
 
 
+def test_there_are_none_where_the_maps_know_too_little() -> None:
+    """Of the ball's pictures the sky is unknown; where it is known to be sky, nothing stands."""
+    maps = exact_maps(toy_cameras(6))
+    known = maps.known_share
+    assert 0.3 < known < 0.9
+    enough = config_with(replace(HALF, least_known=known - 0.01))
+    assert steps_of(enough, maps) is not None
+    too_little = config_with(replace(HALF, least_known=known + 0.01))
+    assert steps_of(too_little, maps) is None
+    void = replace(maps, z=torch.where(maps.z > 0, maps.z, torch.inf))
+    assert void.known_share == pytest.approx(known)
+
+
 def test_where_nothing_stands_the_step_is_like_the_others() -> None:
     """A depth that is infinite is known, and no place for samples."""
     cameras = toy_cameras(6)
+    config = config_with(replace(HALF, least_known=0.0), max_steps=6)
     empty = [np.full((SIZE, SIZE), np.inf, np.float32)] * 6
     maps = DepthMaps.from_arrays(empty, [LENS] * 6, 1.0)
     terms: list[set[str]] = []
@@ -115,7 +129,6 @@ def test_where_nothing_stands_the_step_is_like_the_others() -> None:
     def note(progress: TrainProgress) -> None:
         terms.append(set(progress.losses))
 
-    config = config_with(HALF, max_steps=6)
     train(toy_images(cameras), cameras, range(6), config, seed=0, depth=maps, on_progress=note)
     assert terms == [{"rgb", "interlevel", "distortion", "depth"}] * 6
 
