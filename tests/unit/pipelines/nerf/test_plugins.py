@@ -26,6 +26,7 @@ from pipelines.nerf.space.contraction import scene_from_unit, unit_from_scene
 from pipelines.nerf.training.checkpoint import load_model, save_model
 from pipelines.nerf.training.loop import train
 from pipelines.options import OptionsError, resolve_options, train_config, train_options
+from pipelines.presets import PRESETS
 from tests.unit.pipelines.nerf.models.toy_runs import SCENE, same_state
 from tests.unit.pipelines.nerf.toy_scene import tiny_config, toy_cameras, toy_images, with_model
 
@@ -170,7 +171,7 @@ def test_its_options_are_resolved_and_checked_like_any() -> None:
     resolved = resolve_options("preview", chosen)["train"]
     assert resolved["method"] == "toy"
     assert resolved["model"]["num_samples"] == 5
-    assert resolved["max_steps"] == 1500  # of the preset
+    assert resolved["max_steps"] == PRESETS["preview"].overrides["train"]["max_steps"]
     assert resolved["optimizer"]["lr"] == 0.2  # of the method
     config = train_config(train_options("toy").model_validate(resolved))
     assert type(config.model).__name__ == "ToyConfig"
