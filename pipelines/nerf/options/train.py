@@ -116,7 +116,7 @@ class GuidedConfig:
         0.6, "Share of the run within which they are; then all look for themselves.", ge=0.0, le=1.0
     )
     least_known: float = option(
-        0.5,
+        0.75,
         "Share of the maps' pixels whose depth must be known for there to be any: of fewer such a "
         "step would tell too little.",
         ge=0.0,
