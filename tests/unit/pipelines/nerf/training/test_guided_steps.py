@@ -33,7 +33,14 @@ from tests.unit.pipelines.nerf.toy_scene import (
 )
 
 CPU = torch.device("cpu")
-HALF = GuidedConfig(share=0.5, until=1.0, rays_per_step=512, num_free_samples=3, num_near_samples=5)
+HALF = GuidedConfig(
+    share=0.5,
+    until=1.0,
+    least_known=0.1,
+    rays_per_step=512,
+    num_free_samples=3,
+    num_near_samples=5,
+)
 
 
 def config_with(guided: GuidedConfig, **changes: object) -> TrainConfig:
