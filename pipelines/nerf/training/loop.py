@@ -28,7 +28,7 @@ from pipelines.nerf.engines.gpu.step import StepLosses
 from pipelines.nerf.errors import NerfError
 from pipelines.nerf.judging.metrics import psnr_from_mse
 from pipelines.nerf.models.base import Model
-from pipelines.nerf.options.train import TrainConfig, validate
+from pipelines.nerf.options.train import GuidedConfig, TrainConfig, validate
 from pipelines.nerf.space.cameras import Cameras
 from pipelines.nerf.training.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.nerf.training.gpu_steps import EngineLost, GpuSteps, StepShape
@@ -368,7 +368,7 @@ def _fingerprint(
     free = ("max_steps", "max_seconds", "checkpoint_seconds", "preview_every_steps", "device")
     for name in (*free, "optimizer"):
         del values[name]
-    if config.guided.share == 0.0:  # as of runs from before there were such steps
+    if config.guided == GuidedConfig():  # as of runs from before there were such steps
         del values["guided"]
     known = 0 if depth is None else depth.maps.num_known
     run = {

@@ -204,7 +204,7 @@ def test_a_run_without_them_goes_on_from_a_checkpoint_of_before_there_were_any(
 ) -> None:
     """Such a checkpoint names every option of its run, and has no word of these."""
     cameras, path = toy_cameras(6), tmp_path / "checkpoint.pt"
-    config = config_with(replace(HALF, share=share), max_steps=1)
+    config = config_with(GuidedConfig(share=share), max_steps=1)
     images, maps = toy_images(cameras), exact_maps(cameras)
     train(images, cameras, range(6), config, seed=0, depth=maps, checkpoint_path=path)
     assert ("guided" in load_checkpoint(path)["fingerprint"]) == (share > 0.0)
