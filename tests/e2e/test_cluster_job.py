@@ -33,8 +33,8 @@ def test_polycam_export_goes_through_on_postgresql_s3_and_redis(
     }.items():
         monkeypatch.setenv(name, value)
     archive = tmp_path / "polycam.zip"
-    write_polycam(archive, num=40, width=480)
-    options = merge(SMALL, PLAIN)
+    write_polycam(archive, num=24, width=480)
+    options = merge(merge(SMALL, PLAIN), {"train": {"max_steps": 250}})
 
     embedded = Embedded.at(tmp_path / "home", "127.0.0.1", free_port(), cache)
     supervisor = embedded.supervisor(print)

@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.services, pytest.mark.slow, pytest.mark.timeout(700)]
 
 BRIEF = {
     **PLAIN,
-    "frames": {"num_frames": 32},
+    "train": {"max_steps": 300},
     "pointcloud": {"num_points": 5000, "far_distance": 2.0},
 }
 
@@ -80,8 +80,8 @@ def test_video_over_http_comes_back_as_assets_true_to_the_scene(
     assert poses.mean_center_error < 0.01, poses
     mesh = read_ply(out / "mesh.ply")
     judged = judge_mesh(mesh.points.astype(np.float64), mesh.faces, poses.alignment, truth)
-    assert judged.accuracy < 0.03, judged
-    assert judged.completeness < 0.03, judged
+    assert judged.accuracy < 0.01, judged
+    assert judged.completeness < 0.01, judged
 
 
 def test_hdr_rotated_hevc_clip_goes_through(
