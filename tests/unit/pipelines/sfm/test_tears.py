@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from PIL import Image
 
 from pipelines.options import PosesOptions
 from pipelines.scene.cameras_file import Intrinsics
+from pipelines.sfm import rungs
 from pipelines.sfm.attempts import Ladder
 from pipelines.sfm.checkpoint import Checkpoint
 from pipelines.sfm.report import Outcome, build_report, path_warnings
@@ -26,7 +28,8 @@ from pipelines.workspace import Workspace
 from tests.unit.pipelines.sfm.synthetic_can import around_poses, render
 from tests.unit.pipelines.sfm.synthetic_room import save_photos, save_video_frames
 
-NUM = 48
+NUM, PHOTOS, LONG = 48, 36, 100
+"""Of a path without pictures, with them, and of a film that counts as long here."""
 LENS = Intrinsics(400, 300, 380.0, 380.0, 200.0, 150.0)
 OPENCV = np.diag([1.0, -1.0, -1.0])
 Floats = npt.NDArray[np.float64]
@@ -180,8 +183,11 @@ def turns_off_deg(model: SparseModel, poses: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("kind", ["film", "photos", "long film"])
-def test_a_can_with_its_label_on_it_twice_is_found_whole(tmp_path: Path, kind: str) -> None:
-    num = 156 if kind == "long film" else NUM
+def test_a_can_with_its_label_on_it_twice_is_found_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(rungs, "LONG_FILM", LONG)
+    num = LONG if kind == "long film" else PHOTOS
     pictures = walked_round(num)
     if kind == "photos":
         save_photos(tmp_path, pictures)
@@ -195,6 +201,7 @@ def test_a_can_with_its_label_on_it_twice_is_found_whole(tmp_path: Path, kind: s
     assert chosen.num_registered == num
     assert turns_off_deg(chosen.best, true_poses(num)).max() < 3.0
     told = build_report(outcome, source)["attempts"][-1]
+    assert (told["matcher"] == "key frames") is (kind == "long film")
     assert (told["torn"], told["pairs_left_out"]) == ([], len(chosen.left_out))
 
 
@@ -202,21 +209,21 @@ def test_a_film_that_cannot_be_mended_is_told_as_torn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without its far pairs nothing of it is placed, here by force: the path stays torn."""
-    save_video_frames(tmp_path, walked_round(NUM))
+    save_video_frames(tmp_path, walked_round(PHOTOS))
     whole = Reconstructor.without_pairs
     monkeypatch.setattr(
         Reconstructor,
         "without_pairs",
-        lambda self, pairs: whole(self, [(i, j) for i in range(NUM) for j in range(i + 1, NUM)]),
+        lambda self, pairs: whole(self, list(itertools.combinations(range(PHOTOS), 2))),
     )
     quick = tuple(rung for rung in RUNGS if rung.name == "quick")
     outcome, source = climbed(tmp_path, quick)
     chosen = outcome.chosen
     assert chosen.torn
-    assert chosen.weight <= NUM / 2
+    assert chosen.weight <= PHOTOS / 2
     assert chosen.is_contradicted
     assert replace(chosen, torn=()).is_contradicted is False
-    assert too_few_registered(Standing(NUM, NUM, 0.8, is_contradicted=True)), "more is tried"
+    assert too_few_registered(Standing(PHOTOS, PHOTOS, 0.8, is_contradicted=True)), "more is tried"
     told = build_report(outcome, source)["attempts"][0]["torn"]
     assert told == [[source.files[i], source.files[j]] for i, j in chosen.torn]
     (warning,) = path_warnings(outcome, source)

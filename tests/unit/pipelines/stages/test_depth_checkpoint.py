@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -128,16 +130,34 @@ def with_another_pose(workspace: Workspace) -> dict[str, Any]:
     return {}
 
 
+Change = Callable[[Workspace], dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Change], dict[str, Any]]:
+    """What an attempt that nobody disturbs leaves of a capture after a change."""
+
+    @functools.cache
+    def left(change: Change) -> dict[str, Any]:
+        workspace = capture(tmp_path_factory.mktemp("fresh"))
+        return tiny_job.run(workspace, "depth", **OPTIONS | change(workspace))
+
+    return left
+
+
 @pytest.mark.parametrize("change", [with_more_planes, with_another_picture, with_another_pose])
 @pytest.mark.parametrize("at", ["depth 7/", "standing walls up"])
 def test_what_was_found_for_something_else_is_not_used(
-    tmp_path: Path, swept: list[tuple[int, ...]], change: Any, at: str
+    undisturbed: Callable[[Change], dict[str, Any]],
+    tmp_path: Path,
+    swept: list[tuple[int, ...]],
+    change: Change,
+    at: str,
 ) -> None:
-    workspace, fresh = capture(tmp_path / "old"), capture(tmp_path / "new")
+    workspace = capture(tmp_path)
     cut_short(workspace, at)
     options = OPTIONS | change(workspace)
-    change(fresh)
-    expected = tiny_job.run(fresh, "depth", **options)
+    expected = undisturbed(change)
     del swept[:]
     assert same_bytes(tiny_job.run(workspace, "depth", **options), expected)
     assert len(swept) == 2 * NUM_VIEWS
@@ -198,16 +218,25 @@ def test_it_is_offered_by_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert len(offered) > NUM_VIEWS
 
 
+OUTDOORS = OPTIONS | {"long_side_px": 128, "num_planes": 48}
+
+
+def outdoors(root: Path) -> Workspace:
+    return tiny_job.make_capture(root / "job", NUM_IMAGES, monument.TAKE, 128)
+
+
+@pytest.fixture(scope="module")
+def whole_outdoors(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What an attempt that nobody disturbs leaves of a figure under the sky."""
+    return tiny_job.run(outdoors(tmp_path_factory.mktemp("outdoors")), "depth", **OUTDOORS)
+
+
 @pytest.mark.parametrize("at", ["looking for the sky", "completing plain surfaces"])
-def test_a_sky_that_was_found_stays_found(tmp_path: Path, at: str) -> None:
+def test_a_sky_that_was_found_stays_found(
+    whole_outdoors: dict[str, Any], tmp_path: Path, at: str
+) -> None:
     """The passes behind it see pictures without it, after a cut as well."""
-
-    def outdoors(name: str) -> Workspace:
-        return tiny_job.make_capture(tmp_path / name, NUM_IMAGES, monument.TAKE, 128)
-
-    options = OPTIONS | {"long_side_px": 128, "num_planes": 64}
-    whole = tiny_job.run(outdoors("whole"), "depth", **options)
-    assert whole["summary"]["sky"]["share"] > 0.2
-    workspace = outdoors("cut")
-    cut_short(workspace, at, options)
-    assert same_bytes(tiny_job.run(workspace, "depth", **options), whole)
+    assert whole_outdoors["summary"]["sky"]["share"] > 0.2
+    workspace = outdoors(tmp_path)
+    cut_short(workspace, at, OUTDOORS)
+    assert same_bytes(tiny_job.run(workspace, "depth", **OUTDOORS), whole_outdoors)

@@ -17,6 +17,7 @@ from pipelines.sample.align import similarity
 from pipelines.scene.cameras_file import CamerasFile
 from pipelines.sfm import given
 from pipelines.sfm.given_depth import Beside
+from pipelines.stage import StageContext
 from pipelines.stages import given_poses
 from pipelines.stages.poses import run
 from pipelines.tools.colmap import Reconstructor
@@ -41,11 +42,19 @@ def pictures() -> list[Image.Image]:
     return [render(pose) for pose in TRUTH]
 
 
+@pytest.fixture(scope="module")
+def exact(
+    tmp_path_factory: pytest.TempPathFactory, pictures: list[Image.Image]
+) -> tuple[StageContext, dict[str, Any]]:
+    """What the stage makes of exact poses without points or depth, and its summary."""
+    ctx = context(tmp_path_factory.mktemp("exact") / "job", TRUTH, pictures)
+    return ctx, run(OPTIONS, ctx)
+
+
 def test_exact_poses_are_trusted_and_stay_as_they_are(
-    tmp_path: Path, pictures: list[Image.Image]
+    exact: tuple[StageContext, dict[str, Any]],
 ) -> None:
-    ctx = context(tmp_path, TRUTH, pictures)
-    summary = run(OPTIONS, ctx)
+    ctx, summary = exact
     assert summary["given"]["verdict"] == "trusted"
     assert not codes(summary)
     assert summary["given"]["sampled"]["error_px"] < 0.4
@@ -55,13 +64,10 @@ def test_exact_poses_are_trusted_and_stay_as_they_are(
 
 
 def test_trusted_poses_that_came_without_points_get_those_that_pictures_show(
-    tmp_path: Path, pictures: list[Image.Image]
+    exact: tuple[StageContext, dict[str, Any]],
 ) -> None:
     """Depth is sought where they are: of a long walk few probes would find little."""
-    ctx = context(tmp_path / "job", TRUTH, pictures)
-    summary = run(OPTIONS, ctx)
-    assert summary["given"]["verdict"] == "trusted"
-    assert_as_given(ctx)
+    ctx, _ = exact
     points = read_ply(ctx.out / "points.ply")
     assert len(points.points) > 300
     assert points.colors is not None
@@ -80,17 +86,17 @@ def test_trusted_poses_that_came_without_points_get_those_that_pictures_show(
 def test_what_brings_points_or_depth_is_not_searched_for_more(
     tmp_path: Path, pictures: list[Image.Image]
 ) -> None:
-    ctx = context(tmp_path / "sensor", TRUTH, pictures, depth=1.0)
+    ctx = context(tmp_path / "sensor", TRUTH[:FEW], pictures[:FEW], depth=1.0)
     assert run(OPTIONS, ctx)["given"]["verdict"] == "trusted"
     assert not (ctx.out / "points.ply").exists()
-    ctx = context(tmp_path / "most", TRUTH, pictures, depth=1.0)
+    ctx = context(tmp_path / "most", TRUTH[:FEW], pictures[:FEW], depth=1.0)
     cameras = CamerasFile.load(ctx.workspace.stage("ingest") / "cameras.json")
     lost = replace(cameras.images[3], depth=None)
     images = (*cameras.images[:3], lost, *cameras.images[4:])
     replace(cameras, images=images).save(ctx.workspace.stage("ingest") / "cameras.json")
     run(OPTIONS, ctx)
     assert not (ctx.out / "points.ply").exists(), "one map that is missing changes nothing"
-    ctx = context(tmp_path / "points", TRUTH, pictures)
+    ctx = context(tmp_path / "points", TRUTH[:FEW], pictures[:FEW])
     brought = np.random.default_rng(1).uniform(0, 1, (50, 3)).astype(np.float32)
     path = ctx.workspace.stage("ingest") / "points.ply"
     write_points(path, brought, np.zeros((50, 3), np.uint8))
@@ -103,7 +109,7 @@ def test_few_points_are_worse_than_none(
 ) -> None:
     """A plain thing with a label: depth would be sought where the label is."""
     monkeypatch.setattr(given_poses, "LEAST_SHOWN", 100_000)
-    ctx = context(tmp_path, TRUTH, pictures)
+    ctx = context(tmp_path, TRUTH[:FEW], pictures[:FEW])
     assert run(OPTIONS, ctx)["given"]["verdict"] == "trusted"
     assert not (ctx.out / "points.ply").exists()
 
@@ -111,27 +117,35 @@ def test_few_points_are_worse_than_none(
 def test_poses_are_trusted_all_the_same_where_looking_for_points_breaks_off(
     tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    asked: list[Any] = []
+
     def broken(*args: Any) -> None:
+        asked.append(args)
         raise ToolError("no", code="no", hint="")
 
     monkeypatch.setattr(given, "located", broken)
-    ctx = context(tmp_path, TRUTH, pictures)
+    ctx = context(tmp_path, TRUTH[:FEW], pictures[:FEW])
     summary = run(OPTIONS, ctx)
     assert summary["given"]["verdict"] == "trusted"
     assert "exact poses" in summary["given"]["why"]
+    assert len(asked) == 1
     assert not (ctx.out / "points.ply").exists()
 
 
 def test_points_that_cannot_be_written_cost_no_job(
     tmp_path: Path, pictures: list[Image.Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    written: list[Any] = []
+
     def full(*args: Any) -> None:
+        written.append(args)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(given_poses, "write_points", full)
-    ctx = context(tmp_path, TRUTH, pictures)
+    ctx = context(tmp_path, TRUTH[:FEW], pictures[:FEW])
     assert run(OPTIONS, ctx)["given"]["verdict"] == "trusted"
     assert not (ctx.out / "points.ply").exists()
+    assert len(written) == 1, "so few pictures show enough points to be written"
 
 
 def test_drifted_poses_are_refined_towards_the_truth_at_their_own_place_and_scale(

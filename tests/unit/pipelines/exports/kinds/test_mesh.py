@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,9 @@ from pipelines.exports import mesh_shape
 from pipelines.exports.formats.glb import read_mesh
 from pipelines.exports.formats.ply import Ply, read_ply
 from pipelines.exports.mesh import TexturedMesh, TriangleMesh
+from pipelines.exports.mesh_options import MeshOptions
+from pipelines.exports.mesh_shape import Plan, plan_of
+from pipelines.exports.placement import placement_of
 from pipelines.exports.surface import poisson, poisson_solver, tsdf
 from pipelines.exports.surface.borders import border_loops
 from pipelines.exports.surface.surface_file import SURFACE
@@ -26,13 +31,30 @@ from pipelines.manifest import RunHooks
 from pipelines.registry import get_stage
 from pipelines.scene import gaze
 from pipelines.scene.cameras_file import CamerasFile
+from pipelines.scene.trained_scene import TrainedScene
+from pipelines.stage import StageContext
 from pipelines.workspace import Workspace
 from tests.gltf_validator import problems_of
 from tests.unit.pipelines.stages import tiny_job
 
+ROUGH: dict[str, Any] = {"method": "tsdf", "refine": "none"}
+"""A surface made in a third of the time, for what is done with one."""
+PLAIN: dict[str, Any] = {**ROUGH, "extent": "scene"}
+"""And nobody looks for the subject."""
 
-def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace) -> None:
-    summary = tiny_job.run(job, "mesh")["summary"]
+
+@pytest.fixture(scope="module")
+def meshed(trained_job: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A job whose mesh is made with the options that tests have by default; they must not change
+    it."""
+    root = tmp_path_factory.mktemp("meshed") / "job"
+    shutil.copytree(trained_job.root, root)
+    tiny_job.run(Workspace(root), "mesh")
+    return Workspace(root)
+
+
+def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(meshed: Workspace) -> None:
+    job, summary = meshed, meshed.manifest("mesh")["summary"]
     mesh = read_ply(job.stage("mesh") / "mesh.ply")
     assert len(mesh.faces) == summary["num_faces"] <= 3000 * (1.0 + 0.25 * len(summary["shells"]))
     assert len(mesh.faces) > 50
@@ -52,7 +74,9 @@ def test_both_files_hold_the_same_coloured_mesh_in_their_own_axes(job: Workspace
 def test_what_is_delivered_is_what_was_asked_for_and_later_stages_have_theirs(
     job: Workspace,
 ) -> None:
-    manifest = tiny_job.run(job, "mesh", method="poisson", formats=("usdz", "stl", "usdz"))
+    manifest = tiny_job.run(
+        job, "mesh", method="poisson", refine="none", formats=("usdz", "stl", "usdz")
+    )
     assert manifest["summary"]["method"] == "poisson"
     assert manifest["summary"]["formats"] == ["usdz", "stl"]
     files = {file["path"] for file in manifest["files"]}
@@ -75,7 +99,9 @@ def test_nothing_is_painted_where_no_file_carries_a_texture(job: Workspace) -> N
     ):
         told: list[str] = []
         hooks = RunHooks(on_progress=lambda fraction, message, eta_s, to=told: to.append(message))
-        manifest = tiny_job.run_with(job, "mesh", hooks, formats=formats, extent=extent)
+        manifest = tiny_job.run_with(
+            job, "mesh", hooks, formats=formats, **ROUGH | {"extent": extent}
+        )
         assert ("painting" in told) == painted, formats
         judged = read_mesh(job.stage("mesh") / "judged.glb")
         textured = "obj" in formats
@@ -90,19 +116,29 @@ def test_nothing_is_painted_where_no_file_carries_a_texture(job: Workspace) -> N
 
 
 def test_the_method_is_that_of_where_the_cameras_look(
-    job: Workspace, monkeypatch: pytest.MonkeyPatch
+    meshed: Workspace, job: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever is asked for of it: at a bowl here, and be it from one side."""
-    plain = {"texture": "none", "refine": "none"}
+    assert meshed.manifest("mesh")["summary"]["method"] == "poisson"
     crop = {"shape": "sphere", "center": (0.0, 0.0, 0.0), "radius": 2.0}
-    for asked in ({}, {"extent": "scene"}, {"crop": crop}):
-        assert tiny_job.run(job, "mesh", **plain, **asked)["summary"]["method"] == "poisson", asked
+    for asked in ({"extent": "scene"}, {"crop": crop}):
+        assert _plan(job, tmp_path, **asked).method == "poisson", asked
     monkeypatch.setattr(gaze, "LEAST_ARC_DEG", 400.0)  # nobody walks round anything so far
-    made = tiny_job.run(job, "mesh", **plain)["summary"]
-    assert (made["method"], made["subject"]["kind"]) == ("poisson", "scene")
+    made = _plan(job, tmp_path)
+    assert made.decision is not None
+    assert (made.method, made.decision.kind) == ("poisson", "scene")
     monkeypatch.setattr(gaze, "LEAST_LOOKING", 1.1)  # nor do so many look at one place
+    plain = {"texture": "none", "refine": "none"}
     assert tiny_job.run(job, "mesh", **plain)["summary"]["method"] == "tsdf"
-    assert tiny_job.run(job, "mesh", method="poisson", **plain)["summary"]["method"] == "poisson"
+    assert _plan(job, tmp_path, method="poisson").method == "poisson"
+
+
+def _plan(job: Workspace, out: Path, **changes: Any) -> Plan:
+    """What the stage would look at, and how."""
+    scene = TrainedScene.load(job.stage("train") / "model.zip")
+    options = MeshOptions(**tiny_job.options_of("mesh", **changes))
+    ctx = StageContext(workspace=job, stage="mesh", out=out, checkpoint=out)
+    return plan_of(scene, options, placement_of(options.frame, scene.cameras), ctx)
 
 
 def test_there_is_a_mesh_also_where_the_solver_fails(
@@ -110,38 +146,42 @@ def test_there_is_a_mesh_also_where_the_solver_fails(
 ) -> None:
     monkeypatch.setattr(poisson_solver, "__file__", "/nowhere/poisson_solver.py")
     monkeypatch.setattr(poisson, "LARGE", 0)
-    summary = tiny_job.run(job, "mesh", method="poisson", texture="none")["summary"]
+    wanted = PLAIN | {"method": "poisson", "texture": "none"}
+    summary = tiny_job.run(job, "mesh", **wanted)["summary"]
     assert summary["method"] == "tsdf"
     assert summary["num_faces"] > 500
     assert "No Poisson surface" in caplog.text
 
 
 def test_the_glb_is_painted_with_the_photos_unless_told_not_to_or_full(
-    job: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    meshed: Workspace,
+    job: Workspace,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    summary = tiny_job.run(job, "mesh")["summary"]
-    painted = read_mesh(job.stage("mesh") / "mesh.glb")
+    summary = meshed.manifest("mesh")["summary"]
+    painted = read_mesh(meshed.stage("mesh") / "mesh.glb")
     assert isinstance(painted, TexturedMesh)
-    mesh = read_ply(job.stage("mesh") / "mesh.ply")
+    mesh = read_ply(meshed.stage("mesh") / "mesh.ply")
     assert len(painted.faces) == len(mesh.faces)
     assert list(painted.texture.shape[1::-1]) == summary["texture_size_px"]
     assert max(summary["texture_size_px"]) == summary["texture_px"]
     assert 0.02 < summary["texture_filled"] < 1.0
     corners = painted.vertices[painted.faces]
     assert np.abs(corners - mesh.points[mesh.faces]).max() < 1e-4
-    for spoil in ({"texture": "none"}, {"texture_px": 512, "max_faces": 100_000}):
+    for spoil in ({"texture": "none"}, {"texture_px": 512}):
         full = "texture_px" in spoil
         if full:
             monkeypatch.setattr(packing, "_LEAST_SCALE", 1.0)
             monkeypatch.setattr(charts, "MARGIN_PX", 40)
-        plain = tiny_job.run(job, "mesh", **spoil)["summary"]
+        plain = tiny_job.run(job, "mesh", **PLAIN, **spoil)["summary"]
         assert plain["texture_px"] is None
         assert not isinstance(read_mesh(job.stage("mesh") / "mesh.glb"), TexturedMesh)
         assert ("keeps the colours of its vertices" in caplog.text) == full
 
 
 def test_every_file_with_a_picture_can_have_it_from_the_field(job: Workspace) -> None:
-    wanted = {"formats": ("glb", "obj", "usdz", "ply"), "lods": 1, "max_faces": 1500}
+    wanted = {"formats": ("glb", "obj", "usdz", "ply"), "lods": 1, "max_faces": 1500, **ROUGH}
     messages: list[str] = []
     hooks = RunHooks(on_progress=lambda fraction, message, eta_s: messages.append(message))
     told = tiny_job.run_with(job, "mesh", hooks, texture="field", **wanted)["summary"]
@@ -195,10 +235,11 @@ def test_marching_cubes_find_the_field_where_its_depth_is_and_a_crop_holds(job: 
 
 
 def test_the_mesh_has_the_triangles_asked_for_painted_all_the_same(job: Workspace) -> None:
-    before = tiny_job.run(job, "mesh", method="tsdf")["summary"]
+    whole = {"method": "tsdf", "extent": "scene"}
+    before = tiny_job.run(job, "mesh", texture="none", **whole)["summary"]
     full = read_ply(job.stage("mesh") / "mesh.ply")
     third = before["num_faces"] // 3
-    after = tiny_job.run(job, "mesh", method="tsdf", triangles=third)["summary"]
+    after = tiny_job.run(job, "mesh", triangles=third, **whole)["summary"]
     assert after["num_faces"] == pytest.approx(before["num_faces"] / 3, rel=0.05)
     few = read_ply(job.stage("mesh") / "mesh.ply")
     painted = read_mesh(job.stage("mesh") / "mesh.glb")
@@ -228,7 +269,7 @@ def _lie_within(points: np.ndarray, bounds: dict[str, Any]) -> None:
 
 
 def test_the_subject_alone_ends_where_its_bounds_do(job: Workspace) -> None:
-    near = {"max_distance": 0.6, "max_faces": 3000}
+    near = {"max_distance": 0.6, "max_faces": 3000, "texture": "none"}
     subject = tiny_job.run(job, "mesh", extent="subject", **near)["summary"]
     assert subject["shells"] == []
     alone = read_ply(job.stage("mesh") / "mesh.ply")
@@ -305,12 +346,12 @@ def test_a_cancel_ends_the_stage(job: Workspace) -> None:
 @pytest.mark.parametrize(
     ("part", "changes"),
     [
-        ("fusing depth", {}),
+        ("fusing depth", {"method": "poisson"}),
         ("fusing depth", {"method": "marching_cubes"}),
-        ("moving outlines", {}),
+        ("moving outlines", {"refine": "photos"}),
         ("painting", {}),
-        ("painting", {"texture": "field", "refine": "none"}),
-        ("cutting out the subject", {}),
+        ("painting", {"texture": "field"}),
+        ("cutting out the subject", {"extent": "auto"}),
     ],
 )
 def test_a_cancel_is_noticed_at_the_next_word_of_any_part(
@@ -322,13 +363,14 @@ def test_a_cancel_is_noticed_at_the_next_word_of_any_part(
         is_cancelled=lambda: part in messages,
     )
     with pytest.raises(Cancelled):
-        tiny_job.run_with(job, "mesh", hooks, lods=1, **changes)
+        tiny_job.run_with(job, "mesh", hooks, lods=1, **PLAIN | changes)
     assert messages.count(part) == 1, "it says no more after the cancel"
     assert not job.stage("mesh").exists()
 
 
 def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -> None:
-    summary = tiny_job.run(job, "mesh", lods=2)["summary"]
+    wanted = {"extent": "scene", "refine": "none", "lods": 2}
+    summary = tiny_job.run(job, "mesh", **wanted)["summary"]
     full = read_mesh(job.stage("mesh") / "mesh.glb")
     size, triangles = np.ptp(full.vertices, axis=0).max(), len(full.faces)
     tensor: Any = open3d.core.Tensor  # its stubs refuse its own documented calls
@@ -351,7 +393,7 @@ def test_levels_of_detail_are_coarser_copies_in_the_same_place(job: Workspace) -
 
 
 def test_every_glb_can_have_its_picture_as_a_ktx2(job: Workspace) -> None:
-    wanted = {"glb_texture": "ktx2", "glb_compressed": True, "lods": 1, "texture_px": 1024}
+    wanted = {"glb_texture": "ktx2", "glb_compressed": True, "lods": 1, "texture_px": 1024, **ROUGH}
     told: list[tuple[str, float]] = []
     hooks = RunHooks(on_progress=lambda share, message, eta_s: told.append((message, share)))
     summary = tiny_job.run_with(job, "mesh", hooks, **wanted)["summary"]
@@ -376,10 +418,11 @@ def test_every_glb_can_have_its_picture_as_a_ktx2(job: Workspace) -> None:
 def test_a_mesh_for_which_memory_has_no_room_is_coarser_and_says_so(
     job: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fine = tiny_job.run(job, "mesh", refine="none", texture="none")["summary"]
+    plain = {"extent": "scene", "refine": "none", "texture": "none"}
+    fine = tiny_job.run(job, "mesh", **plain)["summary"]
     assert fine["coarser"] is None
     monkeypatch.setattr(tsdf, "MOST_BLOCKS", 40)
-    coarse = tiny_job.run(job, "mesh", refine="none", texture="none")["summary"]
+    coarse = tiny_job.run(job, "mesh", **plain)["summary"]
     assert coarse["coarser"]["asked_voxel"] == fine["voxel"]
     assert coarse["voxel"] > 1.2 * fine["voxel"]
     assert "mesh.resolution" in coarse["coarser"]["reason"]
@@ -406,7 +449,7 @@ def test_holes_up_to_a_stated_size_are_closed_and_the_report_says_how_many(job: 
 def test_a_subject_to_be_printed_is_watertight_and_others_are_told_not_to_be(
     job: Workspace, caplog: pytest.LogCaptureFixture
 ) -> None:
-    wanted = {"texture": "none", "extent": "subject", "formats": ("stl",)}
+    wanted = {"texture": "none", "refine": "none", "extent": "subject", "formats": ("stl",)}
     for watertight in (False, True):
         found = tiny_job.run(job, "mesh", watertight=watertight, **wanted)["summary"]
         assert found["watertight"] is watertight
@@ -417,7 +460,7 @@ def test_a_subject_to_be_printed_is_watertight_and_others_are_told_not_to_be(
     monkey = pytest.MonkeyPatch()
     with monkey.context() as patch:
         patch.setattr(mesh_shape, "made_watertight", lambda mesh, *others: mesh)
-        found = tiny_job.run(job, "mesh", watertight=True, **wanted)["summary"]
+        found = tiny_job.run(job, "mesh", watertight=True, **PLAIN, texture="none")["summary"]
     assert found["watertight"] is False
     assert "The mesh is not watertight" in caplog.text
 
@@ -434,7 +477,7 @@ def test_where_a_camera_was_is_nothing_whether_its_photo_was_held_out_or_not(
         return mesh
 
     monkeypatch.setattr(mesh_shape, "unblocked", record)
-    tiny_job.run(job, "mesh", num_views=8, formats=("ply",), texture="none")
+    tiny_job.run(job, "mesh", num_views=8, formats=("ply",), **PLAIN)
     cameras = CamerasFile.load(job.stage("train") / "cameras.json")
     eyes = np.asarray([image.world_from_camera for image in cameras.images])[:, :3, 3]
     assert len(eyes) == tiny_job.NUM_IMAGES

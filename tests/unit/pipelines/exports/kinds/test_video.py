@@ -22,6 +22,14 @@ from pipelines.tools.ffmpeg import probe
 from pipelines.workspace import Workspace
 from tests.unit.pipelines.stages import tiny_job
 
+QUICK: dict[str, Any] = {
+    "method": "tsdf",
+    "refine": "none",
+    "extent": "scene",
+    "formats": ("glb",),
+}
+"""Of a mesh that is there, and need not be good."""
+
 
 def test_the_video_plays_in_a_browser(job: Workspace) -> None:
     summary = tiny_job.run(job, "video")["summary"]
@@ -52,8 +60,7 @@ def test_films_heed_the_jobs_mesh_where_it_has_one(
     }
     tiny_job.run(job, "video", **wanted["video"])
     assert heeded == [None]
-    quick = {"method": "tsdf", "refine": "none", "extent": "scene", "texture": "none"}
-    tiny_job.run(job, "mesh", formats=("glb",), **quick)
+    tiny_job.run(job, "mesh", texture="none", **QUICK)
     for kind, options in {**wanted, "meshvideo": {"num_frames": 8}}.items():
         tiny_job.run(job, kind, **options)
     assert len(heeded) == 4
@@ -218,7 +225,7 @@ def _held_out_photo(job: Workspace, which: int) -> np.ndarray:
 
 
 def test_the_mesh_makes_the_film_more_like_photos_that_training_never_saw(job: Workspace) -> None:
-    tiny_job.run(job, "mesh", formats=("glb",))
+    tiny_job.run(job, "mesh", formats=("glb",), extent="scene")
     errors = []
     for which in range(3):
         photo = _held_out_photo(job, which)
@@ -240,7 +247,7 @@ def test_a_job_without_a_picture_on_its_mesh_films_what_was_trained(job: Workspa
     trained, _ = _still(job, 64, mesh_detail=False)
     for texture in (None, "none"):
         if texture is not None:
-            tiny_job.run(job, "mesh", formats=("glb",), texture=texture)
+            tiny_job.run(job, "mesh", texture=texture, **QUICK)
         enlarged, told = _still(job, 128, field_px=32)
         assert told["mesh_detail"] is False
         shrunk = enlarged.reshape(64, 2, -1, 2, 3).mean(axis=(1, 3))
@@ -252,7 +259,7 @@ def test_a_job_without_a_picture_on_its_mesh_films_what_was_trained(job: Workspa
 def test_what_the_mesh_is_not_asked_for_stays_as_it_was(job: Workspace) -> None:
     before, _ = _still(job, 64, outputs=("rgb", "depth"), mesh_detail=False)
     depth = _frame(job, "depth")
-    tiny_job.run(job, "mesh", formats=("glb",))
+    tiny_job.run(job, "mesh", **QUICK)
     after, _ = _still(job, 64, outputs=("depth", "rgb"))
     np.testing.assert_array_equal(_frame(job, "depth"), depth)
     assert np.abs(after - before).mean() > 0.5
