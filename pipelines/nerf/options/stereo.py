@@ -84,6 +84,12 @@ class StereoConfig:
         "that several views see in the same place, and other views agree; and where neighbours see "
         "such a wall.",
     )
+    hanging_fronts: bool = option(
+        True,
+        "Lay patches of even brightness on the upright plane below the near edge of a level "
+        "surface, as of a chest's top, where lines on it are seen in the same place by several "
+        "views. Part of standing_walls.",
+    )
     level_tops: bool = option(
         True,
         "Lay plain table tops at the height of their rims: patches of even brightness, of which "

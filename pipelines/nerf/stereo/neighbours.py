@@ -7,6 +7,7 @@ pass. Symbols: V views, P points.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,11 @@ _NEAREST, _FARTHEST = 0.6, 3.0
 _PARTS, _BEHIND = (6, 8), 1.5
 """Rows and columns of a picture's parts, and how many times as far a point may be as the nearest
 in its part to be seen with it."""
+_LEAST_IN_PART = 0.1
+"""Of the mean number of points, so many make a part one where something is known."""
+_ENOUGH, _LEAST_GAIN = 2.0, 0.15
+"""Neighbours at the best angle that are enough for a part; and how much of that, in parts of the
+whole picture, one must bring to be chosen for it."""
 _HIDDEN = 0.4
 """What share of the points that pictures hold must be behind something for that to be heeded: it
 is .61 and .75 in flats of 4 and 9 rooms, and .00 to .37 in single rooms, outdoors and around
@@ -61,14 +67,111 @@ def choose_neighbours(
         found = pair_scores_fast(toward, held, facing, best_angle_deg, (_BELOW_DEG, _ABOVE_DEG))
         part = held.sum(axis=1) / np.maximum(shown.sum(axis=1), 1)
         scores += part[:, None] * found
-    chosen = []
+    chosen, cameras = [], _Cameras.of(views)
     for index, score in enumerate(scores):
         if not shown[index].any():
             chosen.append(_nearest(centers, facing, index, count))
             continue
-        order = np.argsort(-score, kind="stable")[:count]
-        chosen.append([int(other) for other in order if score[other] > _LEAST_SCORE])
+        parts = _Parts.of(views[index], points, shown[index])
+        chosen.append(_covering(parts.liked_by(cameras, best_angle_deg), score, count))
     return chosen
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The middles [K, 3] of those parts of a picture where nothing is known, as far away as what is
+    known close by; and where the view is, [3]."""
+
+    middles: Floats
+    eye: Floats
+
+    @classmethod
+    def of(cls, view: StereoView, points: Floats, shown: NDArray[np.bool_]) -> _Parts:
+        """shown: [P], which of the points the view sees; at least one."""
+        depths, u, v, _ = view.projected(points[shown])
+        rows, columns = _PARTS
+        height, width = view.picture.shape
+        row = np.minimum((v * rows / height).astype(np.int64), rows - 1)
+        column = np.minimum((u * columns / width).astype(np.int64), columns - 1)
+        down, across = np.divmod(np.arange(rows * columns), columns)
+        depth = np.zeros(rows * columns)
+        count = np.bincount(row * columns + column, minlength=rows * columns)
+        known = np.flatnonzero(count >= _LEAST_IN_PART * len(depths) / len(count))
+        for part in known:
+            depth[part] = np.median(depths[(row == down[part]) & (column == across[part])])
+        empty = np.setdiff1d(np.arange(rows * columns), known)
+        down, across = down[empty], across[empty]
+        far = (down[:, None] - known // columns) ** 2 + (across[:, None] - known % columns) ** 2
+        depth = depth[known[far.argmin(axis=1)]]
+        fx, fy, cx, cy = view.lens
+        x = ((across + 0.5) * width / columns - cx) / fx
+        y = ((down + 0.5) * height / rows - cy) / fy
+        local = np.stack([x, y, np.ones(len(x))], axis=-1) * depth[:, None]
+        return cls(local @ view.world_from_camera[:, :3].T + view.center, view.center)
+
+    def liked_by(self, others: _Cameras, best_angle_deg: float) -> Floats:
+        """[V, K]: how good each view's angle is to each part that it has in its picture; else 0."""
+        mine, yours = self.middles - self.eye, self.middles - others.centers[:, None]
+        lengths = np.linalg.norm(mine, axis=-1) * np.linalg.norm(yours, axis=-1)
+        cosine = np.einsum("kc,vkc->vk", mine, yours) / np.maximum(lengths, 1e-12)
+        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        spread = np.where(angle < best_angle_deg, _BELOW_DEG, _ABOVE_DEG)
+        liked: Floats = np.exp(-0.5 * ((angle - best_angle_deg) / spread) ** 2)
+        return liked * others.show(yours)
+
+
+@dataclass(frozen=True)
+class _Cameras:
+    """All views': centers [V, 3], turns [V, 3, 3] of their frames in the world, lenses [V, 4] as
+    `StereoView.lens`, sizes [V, 2], width and height."""
+
+    centers: Floats
+    turns: Floats
+    lenses: Floats
+    sizes: Floats
+
+    @classmethod
+    def of(cls, views: Sequence[StereoView]) -> _Cameras:
+        """Those of the views."""
+        return cls(
+            np.stack([view.center for view in views]),
+            np.stack([view.world_from_camera[:, :3] for view in views]),
+            np.array([view.lens for view in views]),
+            np.array([view.picture.shape[::-1] for view in views], np.float64),
+        )
+
+    def show(self, away: Floats) -> NDArray[np.bool_]:
+        """[V, K]: which places each picture shows. away: [V, K, 3], from each view's centre."""
+        x, y, z = np.moveaxis(np.matmul(away, self.turns), -1, 0)
+        ahead = np.where(z > 0, z, np.inf)
+        fx, fy, cx, cy = self.lenses.T[..., None]
+        u, v = fx * x / ahead + cx, fy * y / ahead + cy
+        width, height = self.sizes.T[..., None]
+        shown: NDArray[np.bool_] = (z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        return shown
+
+
+def _covering(liked: Floats, score: Floats, count: int) -> list[int]:
+    """The views of the best scores [V]; but of the later half each one that sees parts without
+    points which too few of those before it see, if there is any.
+
+    What is plain has no points: by these alone all of them may look past it. liked: [V, K], as of
+    `_Parts.liked_by`.
+    """
+    order = [int(o) for o in np.argsort(-score, kind="stable") if score[o] > _LEAST_SCORE]
+    chosen = order[: count - count // 2]
+    covered = liked[chosen].sum(axis=0)
+    while len(chosen) < count:
+        gain = np.minimum(np.maximum(_ENOUGH - covered, 0.0), liked).sum(axis=1)
+        gain[chosen] = 0.0
+        gain[score <= _LEAST_SCORE] = 0.0
+        best = int(gain.argmax())
+        if gain[best] < _LEAST_GAIN * np.prod(_PARTS):
+            break
+        chosen.append(best)
+        covered += liked[best]
+    rest = [other for other in order if other not in chosen]
+    return chosen + rest[: count - len(chosen)]
 
 
 def _portions(num_points: int, num_views: int) -> list[slice]:

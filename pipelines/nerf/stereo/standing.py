@@ -1,4 +1,5 @@
-"""Plain walls, which nothing can match, stood up where the floor ends.
+"""Plain walls, which nothing can match, stood up where the floor ends; and fronts below the edges
+of tops (`stereo.fronts`).
 
 A white wall with nothing on it has no known point at all. But it meets the floor, and where it does
 every view sees the same line in space: the edge of the floor against a plain patch. (Where a thing
@@ -17,19 +18,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from skimage.segmentation import expand_labels
 
 from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.options.stereo import StereoConfig
+from pipelines.nerf.stereo.borders import (
+    LEAST_VIEW_PX,
+    LEAST_VIEWS,
+    Look,
+    best_line,
+    ends_on,
+    look_at,
+    spread_deg,
+)
 from pipelines.nerf.stereo.completing import confirmed
 from pipelines.nerf.stereo.engines import KERNELS, Engine
+from pipelines.nerf.stereo.fronts import Front, find_fronts, laid_on_fronts
 from pipelines.nerf.stereo.maps import MapShelf, Progress, depths_of, surface_points
 from pipelines.nerf.stereo.neighbours import choose_neighbours
-from pipelines.nerf.stereo.patches import Labels, even_patches, shelved_patches
+from pipelines.nerf.stereo.patches import even_patches, shelved_patches
 from pipelines.nerf.stereo.planes import (
     LEVEL,
     ON_PLANE,
@@ -43,8 +53,6 @@ from pipelines.nerf.stereo.planes import (
 )
 from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
 from pipelines.nerf.stereo.spreading import (
-    MOST_KNOWN,
-    PlainPatches,
     refutes,
     replaceable,
     spread,
@@ -55,18 +63,9 @@ Depths = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
-_LEAST_AREA = 0.004
-"""A patch is open if it is so large, of the picture, and no more than half of it is known."""
-_LEAST_INSIDE = 0.5
-"""What is thinner is an edge that is not sharp, neither here nor there."""
-_REACH_PX = 5
-"""Matching takes squares, so depths next to an edge are not to be had, or are the other side's."""
 _UPRIGHT = 0.1
 """Cosine, up to which planes stand."""
-_MOST_LINES, _HYPOTHESES, _MOST_ENDS = 12, 2000, 20_000
-_LEAST_PX, _LEAST_VIEWS, _LEAST_VIEW_PX, _MOST_VIEW_PX = 60, 3, 8, 60
-_LEAST_LENGTH = 0.03
-"""Of a line between two points that stand for one, relative to their depth."""
+_MOST_LINES, _MOST_ENDS = 12, 20_000
 _LEAST_SPREAD_DEG = 1.0
 _BEHIND = 0.02
 _BEYOND, _MOST_BEYOND, _MOST_PLACES = 0.06, 0.2, 200
@@ -78,21 +77,6 @@ _BENEATH_WEIGHT = 0.5
 _EXTRAPOLATED = 3.0
 _PLANES_SHARE, _LOOK_SHARE, _LAY_SHARE, _SPREAD_SHARE = 0.1, 0.35, 0.5, 0.75
 _MESSAGE = "standing walls up"
-
-
-@dataclass(frozen=True)
-class _Look(PlainPatches):
-    """A view's plain patches, and the places of their borders that have a known depth next to them.
-
-    Of each of K places: x, y, its ray at z = 1; the patch; z: the depth that is known next to it,
-    in another patch; plane: which one that lies on, or -1.
-    """
-
-    x: Floats
-    y: Floats
-    patch: Numbers
-    z: Floats
-    plane: Numbers
 
 
 @dataclass(frozen=True)
@@ -118,7 +102,8 @@ def stood_up(
     *,
     up: Floats | None = None,
 ) -> MapShelf:
-    """The maps with plain patches on the walls that their borders with the floor tell of.
+    """The maps with plain patches on the walls that their borders with the floor tell of, and on
+    fronts below tops.
 
     Pixels of plain patches change that are unknown, or seem to be nearer than the wall: they get
     its depth where a neighbour agrees and none sees through it, or twice as many agree. patches: a
@@ -130,14 +115,14 @@ def stood_up(
     )
     up = up_of(views) if up is None else up
     planes = planes[_is_level_or_upright(levels_of(up, planes))]
-    floors = floors_of(up, planes, points, depths)
-    if not floors:
+    if not (np.abs(levels_of(up, planes)) >= LEVEL).any():
         return maps
+    floors = floors_of(up, planes, points, depths)
 
-    def look(index: int) -> _Look:
+    def look(index: int) -> Look:
         view = views[index]
         parts = even_patches(view.picture, shelved_patches(view, index, patches))
-        return _look(view, maps[index].z, planes, parts)
+        return look_at(view, maps[index].z, planes, parts)
 
     looks = []
     for index, found in enumerate(each_ahead(look, range(len(views)))):
@@ -146,13 +131,20 @@ def stood_up(
         on_progress(_PLANES_SHARE + share, _MESSAGE)
     walls = _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
     walls = [wall for wall in walls if not _goes_on(views, depths_of(maps), wall)]
-    if not walls:
+    fronts: list[Front] = []
+    if config.hanging_fronts:
+        known = planes, points, depths
+        on_edge = partial(on_progress, _LOOK_SHARE, _MESSAGE)
+        fronts = find_fronts(looks, depths_of(maps), up, *known, on_edge)
+    if not walls and not fronts:
         return maps
     every, stands_on = _with_walls(planes, walls, float(np.median(depths)))
     filled = shelves.scratch("on walls", len(views))
 
     def lay(index: int) -> None:
-        filled[index] = _laid(looks[index], maps[index].z, every, stands_on)
+        z = maps[index].z
+        laid = _laid(looks[index], z, every, stands_on) if walls else z
+        filled[index] = laid_on_fronts(looks[index], laid, fronts, planes[floors])
 
     for index, _ in enumerate(each_ahead(lay, range(len(views)))):
         share = (_LAY_SHARE - _LOOK_SHARE) * (index + 1) / len(views)
@@ -174,7 +166,7 @@ def stood_up(
         looks,
         maps,
         laid,
-        every[np.array(stands_on) >= 0],
+        np.concatenate([every[np.array(stands_on) >= 0], *(front.plane[None] for front in fronts)]),
         neighbours,
         config,
         lambda done: on_progress(_SPREAD_SHARE + (1.0 - _SPREAD_SHARE) * done, _MESSAGE),
@@ -190,47 +182,8 @@ def _is_level_or_upright(levels: Floats) -> Bools:
     return steep
 
 
-def _look(view: StereoView, z: Depths, planes: Floats, patches: Labels) -> _Look:
-    known, usable = z > 0, view.picture >= 0.0
-    num = int(patches.max()) + 1
-    area = np.bincount(patches.ravel(), minlength=num)
-    num_known = np.bincount(patches[known], minlength=num)
-    edges = _edges(patches)
-    inside = np.bincount(patches[~edges], minlength=num)
-    is_open = (area >= _LEAST_AREA * patches.size) & (num_known < MOST_KNOWN * area)
-    is_open &= inside >= _LEAST_INSIDE * area
-    places = np.arange(patches.size).reshape(patches.shape)
-    expand: Any = expand_labels
-    nearest = expand(np.where(known & ~is_open[patches], places + 1, 0), _REACH_PX)
-    border = edges & is_open[patches] & (nearest > 0) & usable
-    here, there = np.nonzero(border), np.unravel_index(nearest[border] - 1, patches.shape)
-    columns, rows = (axis.ravel() for axis in ray_grid(view))
-    depth = z[there].astype(np.float64)
-    off = np.abs(inverse_depths(view, planes, columns[there[1]], rows[there[0]]) * depth - 1.0)
-    plane = off.argmin(axis=0)
-    plane = np.where(off[plane, np.arange(len(plane))] < ON_PLANE, plane, -1)
-    # An edge is some pixels wide: it is half way between what is plain and what is known.
-    x = 0.5 * (columns[here[1]] + columns[there[1]])
-    y = 0.5 * (rows[here[0]] + rows[there[0]])
-    inverse = inverse_depths(view, planes, x, y)[plane, np.arange(len(plane))]
-    depth = np.where((plane >= 0) & (inverse > 1e-9), 1.0 / np.maximum(inverse, 1e-9), depth)
-    patch = patches[border].astype(np.int64)
-    return _Look(view, patches, np.flatnonzero(is_open), x, y, patch, depth, plane)
-
-
-def _edges(patches: Labels) -> Bools:
-    """[H, W]: the pixels that have one of another patch above, below or beside them."""
-    edges = np.zeros(patches.shape, bool)
-    down, right = patches[:-1] != patches[1:], patches[:, :-1] != patches[:, 1:]
-    edges[:-1] |= down
-    edges[1:] |= down
-    edges[:, :-1] |= right
-    edges[:, 1:] |= right
-    return edges
-
-
 def _find_walls(
-    looks: Sequence[_Look],
+    looks: Sequence[Look],
     planes: Floats,
     floors: Sequence[int],
     on_line: Callable[[], None] = lambda: None,
@@ -240,7 +193,7 @@ def _find_walls(
     centers = np.stack([look.view.center for look in looks])
     walls = []
     for floor in floors:
-        places, depths, views, pieces = _ends_of(floor, looks)
+        places, depths, views, pieces = ends_on(floor, looks)
         if len(places) > _MOST_ENDS:
             some = rng.choice(len(places), _MOST_ENDS, replace=False)
             places, depths, views, pieces = places[some], depths[some], views[some], pieces[some]
@@ -251,18 +204,18 @@ def _find_walls(
         flat = places @ axes.T
         for _ in range(_MOST_LINES):
             on_line()
-            line = _best_line(flat, depths, views, pieces, rng)
+            line = best_line(flat, depths, views, pieces, rng)
             if line is None:
                 break
             away = np.abs(flat @ line[:2] - line[2])
             on_it = away < ON_PLANE * depths
-            seen_by = np.flatnonzero(np.bincount(views[on_it]) >= _LEAST_VIEW_PX)
+            seen_by = np.flatnonzero(np.bincount(views[on_it]) >= LEAST_VIEW_PX)
             facing = line[:2] @ axes
             plane = np.append(facing, line[2])
             direction, point = np.cross(normal, facing), places[on_it][0]
             if (
-                len(seen_by) >= _LEAST_VIEWS
-                and _spread_deg(centers[seen_by] - point, direction) >= _LEAST_SPREAD_DEG
+                len(seen_by) >= LEAST_VIEWS
+                and spread_deg(centers[seen_by] - point, direction) >= _LEAST_SPREAD_DEG
                 and _share_behind(centers, plane) <= _BEHIND
             ):
                 some = np.flatnonzero(on_it)[:: max(1, int(on_it.sum()) // _MOST_PLACES)]
@@ -271,74 +224,6 @@ def _find_walls(
             flat, depths, views, pieces = flat[left], depths[left], views[left], pieces[left]
             places = places[left]
     return walls
-
-
-def _ends_of(floor: int, looks: Sequence[_Look]) -> tuple[Floats, Floats, Numbers, Numbers]:
-    """Where open patches begin on a floor: [K, 3] world, and of each its depth, view and patch."""
-    places, depths = [np.zeros((0, 3))], [np.zeros(0)]
-    views, pieces = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    begun = 0
-    for number, look in enumerate(looks):
-        at = look.plane == floor
-        depth = look.z[at]
-        local = np.stack([look.x[at] * depth, look.y[at] * depth, depth], axis=-1)
-        places.append(local @ look.view.world_from_camera[:, :3].T + look.view.center)
-        depths.append(depth)
-        views.append(np.full(len(depth), number))
-        pieces.append(begun + look.patch[at])
-        begun += int(look.patches.max()) + 1
-    return (
-        np.concatenate(places),
-        np.concatenate(depths),
-        np.concatenate(views),
-        np.concatenate(pieces),
-    )
-
-
-def _best_line(
-    places: Floats, depths: Floats, views: Numbers, pieces: Numbers, rng: np.random.Generator
-) -> Floats | None:
-    """The line (a, b, c) with (a, b) . X = c and a^2 + b^2 = 1 that most views show, if any.
-
-    places: [K, 2] on the floor, with their depths, views and patches. By RANSAC over pairs of the
-    same patch; one view's pixels count up to 60, or one that is near it would outvote all others.
-    """
-    if len(places) < _LEAST_PX:
-        return None
-    one = rng.integers(0, len(places), _HYPOTHESES)
-    order = np.argsort(pieces, kind="stable")
-    begin = np.searchsorted(pieces[order], pieces[one], "left")
-    end = np.searchsorted(pieces[order], pieces[one], "right")
-    two = order[begin + (rng.random(len(one)) * (end - begin)).astype(np.int64)]
-    step = places[two] - places[one]
-    length = np.linalg.norm(step, axis=1)
-    far = length > _LEAST_LENGTH * depths[one]
-    best, most = None, float(_LEAST_PX)
-    for at, (x, y) in zip(places[one[far]], step[far] / length[far, None], strict=True):
-        across = np.array([-y, x])
-        on_it = np.abs((places - at) @ across) < ON_PLANE * depths
-        count = np.bincount(views[on_it])
-        votes = float(np.minimum(count, _MOST_VIEW_PX).sum())
-        if votes >= most and (count >= _LEAST_VIEW_PX).sum() >= _LEAST_VIEWS:
-            best, most = np.append(across, across @ at), votes
-    if best is None:
-        return None
-    for _ in range(3):
-        on_it = np.abs(places @ best[:2] - best[2]) < ON_PLANE * depths
-        weight = 1.0 / depths[on_it]
-        middle = weight @ places[on_it] / weight.sum()
-        _, _, axes = np.linalg.svd((places[on_it] - middle) * weight[:, None], full_matrices=False)
-        best = np.append(axes[1], axes[1] @ middle)
-    return best
-
-
-def _spread_deg(to_centers: Floats, direction: Floats) -> float:
-    """The largest angle, seen along the line, between cameras [V, 3]: how much it would move if it
-    were the edge of something that hides the floor.
-    """
-    normal = np.cross(to_centers, direction)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return float(np.degrees(np.arccos(np.clip(np.abs(normal @ normal.T).min(), 0.0, 1.0))))
 
 
 def _share_behind(centers: Floats, plane: Floats) -> float:
@@ -382,7 +267,7 @@ def _with_walls(planes: Floats, walls: Sequence[_Wall], depth: float) -> tuple[F
     return np.array(every), stands_on
 
 
-def _laid(look: _Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> Depths:
+def _laid(look: Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> Depths:
     """The map [H, W] with its open patches on the planes that their borders touch.
 
     planes: [P, 4], those known and the walls. stands_on: of each the floor, or -1. A border touches

@@ -101,3 +101,34 @@ def test_a_few_points_at_a_time_give_the_same_neighbours(monkeypatch: pytest.Mon
     assert len(neighbours._portions(len(POINTS), len(views))) == 11
     assert choose_neighbours(views, POINTS, 4, 6.0) == whole
     assert all(whole[: 2 * PER_ROOM])
+
+
+def before_wall(x: float, down_deg: float) -> StereoView:
+    """A camera two metres before a wall at z = 0, that looks down by some degrees."""
+    down = np.radians(down_deg)
+    axis = np.array([0.0, -np.sin(down), np.cos(down)])
+    below = np.array([0.0, -np.cos(down), -np.sin(down)])
+    pose = np.column_stack([[1.0, 0.0, 0.0], below, axis, [x, 0.0, -2.0]])
+    return StereoView(np.zeros((72, 96), np.float32), LENS, pose)
+
+
+def lower(neighbours: list[int]) -> int:
+    """How many of the neighbours look down."""
+    return sum(index >= 9 for index in neighbours)
+
+
+def test_who_alone_sees_the_lower_half_of_a_picture_is_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A plain cupboard below a shelf has no points: by these, who looks at the shelf is best."""
+    shelf = [before_wall(x, 0.0) for x in np.linspace(-0.3, 0.3, 9)]
+    cupboard = [before_wall(x, 25.0) for x in (-0.12, 0.0, 0.12)]
+    random = np.random.default_rng(0)
+    points = random.uniform([-0.6, -0.3, 0.0], [0.6, 0.4, 0.0], (500, 3))
+    found = choose_neighbours([*shelf, *cupboard], points, 6, 6.0)
+    assert all(len(set(one)) == 6 for one in found)
+    assert min(lower(one) for one in found[9:]) >= 2
+    monkeypatch.setattr(neighbours, "_LEAST_GAIN", 2.0)
+    by_points = choose_neighbours([*shelf, *cupboard], points, 6, 6.0)
+    assert max(lower(one) for one in by_points[9:]) < 2
+    assert [one[:3] for one in found] == [one[:3] for one in by_points]
