@@ -56,6 +56,8 @@ _ALIKE = 0.97
 _ENDS, _BEHIND = 1.0, 0.1
 """Percent of an edge's places that lie beyond what counts as its end, either way; and how far
 behind it, by its depth, the top tells of that, too."""
+_CLEAR = 0.05
+"""How far above a floor an edge is, by its distance."""
 _CUT_PX = 3
 """Where a picture ends nothing else does: its own border is so far away at least."""
 _LEAST_ON = 0.5
@@ -87,6 +89,17 @@ class Front:
         local = np.stack([x[columns] * z, y[rows, 0] * z, z], axis=-1)
         world = local @ look.view.world_from_camera[:, :3].T + look.view.center
         return z, world @ self.along, world @ self.up - self.level
+
+    def is_above(self, planes: Floats, eye: Floats) -> Bools:
+        """[P]: which planes lie below the middle of the edge; the top itself, as a rule, does not.
+
+        eye: [3], who looks, for what is too near to tell.
+        """
+        middle = 0.5 * (self.low + self.high) * self.along
+        middle = middle + self.level * self.up + self.plane[3] * self.plane[:3]
+        height = (planes[:, :3] @ middle - planes[:, 3]) * np.sign(planes[:, :3] @ self.up)
+        above: Bools = height > _CLEAR * float(np.linalg.norm(middle - eye))
+        return above
 
     def is_below(self, z: Floats, s: Floats, h: Floats) -> Bools:
         """Which places lie below the edge, and between its ends."""
@@ -326,9 +339,8 @@ def laid_on_fronts(look: Look, z: Depths, fronts: Sequence[Front], floors: Float
         inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0)
         may = front.is_below(depth, s, h) & replaceable(z[rows, columns], inverse)
         x, y = ray_grid(look.view)
-        for ground in (
-            inverse_depths(look.view, floors, x[columns], y[rows, 0]) if len(floors) else ()
-        ):
+        for floor in floors[front.is_above(floors, look.view.center)]:
+            ground = inverse_depths(look.view, floor[None], x[columns], y[rows, 0])[0]
             may &= (ground <= 1e-9) | (inverse >= (1.0 - 2.0 * ON_PLANE) * ground)
         laid[rows[may], columns[may]] = depth[may].astype(np.float32)
     return laid

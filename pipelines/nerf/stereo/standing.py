@@ -162,11 +162,13 @@ def stood_up(
         engine,
         MapShelf.kept(shelves, "walls", len(views), fresh=True),
     )
+    if not walls:  # of a front nobody else learns: it has ends
+        return laid
     return spread(
         looks,
         maps,
         laid,
-        np.concatenate([every[np.array(stands_on) >= 0], *(front.plane[None] for front in fronts)]),
+        every[np.array(stands_on) >= 0],
         neighbours,
         config,
         lambda done: on_progress(_SPREAD_SHARE + (1.0 - _SPREAD_SHARE) * done, _MESSAGE),

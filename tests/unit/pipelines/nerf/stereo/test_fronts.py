@@ -39,6 +39,14 @@ def test_a_white_front_hangs_below_the_edge_of_its_top(lines: bool, least: float
     assert known - right < 0.02
 
 
+def test_a_front_needs_neither_ends_nor_a_foot_where_there_are_gaps_on_it() -> None:
+    """Nothing is known below its top then, which is no floor all the same."""
+    known, right = white_known(walk(whole=False))
+    assert right > 0.75
+    assert known - right < 0.02
+    assert white_known(walk(whole=False, lines=False))[0] < 0.02
+
+
 def test_what_else_is_known_stays_as_it_was() -> None:
     seen = walk()
     for one, found in zip(seen, finished(seen), strict=True):

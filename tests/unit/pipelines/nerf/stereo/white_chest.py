@@ -39,15 +39,15 @@ class Seen:
         return DepthMap(z, np.where(z > 0, 4, 0).astype(np.uint8))
 
 
-def walk(*, front: bool = True, lines: bool = True) -> list[Seen]:
-    """Ten cameras that pass by, up and down a little. lines: on what is white."""
-    return [
-        look(np.array([-0.5 + 0.11 * k, -0.1 - 0.12 * (k % 3), 0.1]), front=front, lines=lines)
-        for k in range(10)
-    ]
+def walk(*, front: bool = True, lines: bool = True, whole: bool = True) -> list[Seen]:
+    """Ten cameras that pass by, up and down a little. lines: on what is white. whole: whether the
+    pictures hold its ends and its foot."""
+    half, floor = (HALF, FLOOR) if whole else (3.0 * HALF, 2.0 * FLOOR)
+    eyes = [np.array([-0.5 + 0.11 * k, -0.1 - 0.12 * (k % 3), 0.1]) for k in range(10)]
+    return [look(eye, front, lines, half, floor) for eye in eyes]
 
 
-def look(eye: Floats, *, front: bool, lines: bool) -> Seen:
+def look(eye: Floats, front: bool, lines: bool, half: float, floor: float) -> Seen:
     """A camera that looks ahead and down by 20 degrees."""
     down = np.radians(20.0)
     cosine, sine = np.cos(down), np.sin(down)
@@ -57,10 +57,10 @@ def look(eye: Floats, *, front: bool, lines: bool) -> Seen:
     rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], np.float64(1.0)), axis=-1)
     rays = rays @ rotation.T
     to = [
-        _hits(eye, rays, 1, TOP, lambda at: (np.abs(at[..., 0]) < HALF) & (at[..., 2] > FRONT)),
-        _hits(eye, rays, 2, FRONT, lambda at: (np.abs(at[..., 0]) < HALF) & (at[..., 1] > TOP)),
-        _hits(eye, rays, 1, FLOOR, lambda at: at[..., 2] < WALL),
-        _hits(eye, rays, 2, WALL, lambda at: at[..., 1] < FLOOR),
+        _hits(eye, rays, 1, TOP, lambda at: (np.abs(at[..., 0]) < half) & (at[..., 2] > FRONT)),
+        _hits(eye, rays, 2, FRONT, lambda at: (np.abs(at[..., 0]) < half) & (at[..., 1] > TOP)),
+        _hits(eye, rays, 1, floor, lambda at: at[..., 2] < WALL),
+        _hits(eye, rays, 2, WALL, lambda at: at[..., 1] < floor),
     ]
     if not front:
         to[ON_FRONT][:] = np.inf
