@@ -11,7 +11,7 @@ Depth is along the camera's axis (z), 0 where unknown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -154,16 +154,8 @@ def _edges_of_top(
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first)])
     flat = places @ axes.T
-    every = flat, depths, pieces
     found: list[tuple[Front, Numbers]] = []
-    for _ in range(_MOST_EDGES):
-        on_edge()
-        line = best_line(flat, depths, views, pieces, rng)
-        if line is None:
-            break
-        away = np.abs(flat @ line[:2] - line[2])
-        on_it = away < ON_PLANE * depths
-        seen_by = np.flatnonzero(np.bincount(views[on_it]) >= LEAST_VIEW_PX)
+    for line, on_it, seen_by in _lines_of(_MOST_EDGES, rng, flat, depths, views, pieces, on_edge):
         plane = np.append(line[:2] @ axes, line[2])
         plane *= np.sign(np.median(centers[seen_by] @ plane[:3]) - plane[3]) or 1.0
         along = np.cross(normal, plane[:3])
@@ -175,16 +167,38 @@ def _edges_of_top(
         before = np.flatnonzero(centers @ plane[:3] > plane[3])
         if (
             len(np.intersect1d(seen_by, before)) >= LEAST_VIEWS
-            and _is_straight(line, pieces[on_it], *every)
-            and spread_deg(centers[seen_by] - places[on_it][0], along) >= _LEAST_EDGE_DEG
+            and _is_straight(line, pieces[on_it], flat, depths, pieces)
+            and spread_deg(centers[seen_by] - places[on_it[0]], along) >= _LEAST_EDGE_DEG
             and _is_near_edge(front, known, depth)
             and not any(_overlap(front, other) for other, _ in found)
         ):
             found.append((front, before))
-        left = away >= 2.0 * ON_PLANE * depths
-        flat, depths, views, pieces = flat[left], depths[left], views[left], pieces[left]
-        places = places[left]
     return found
+
+
+def _lines_of(
+    most: int,
+    rng: np.random.Generator,
+    places: Floats,
+    depths: Floats,
+    views: Numbers,
+    pieces: Numbers,
+    on_line: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[Floats, Numbers, Numbers]]:
+    """Lines as `best_line` finds them, one after the other among what the ones before have left;
+    of each the numbers of the places on it, and the views that see it."""
+    left = np.arange(len(places))
+    for _ in range(most):
+        on_line()
+        line = best_line(places[left], depths[left], views[left], pieces[left], rng)
+        if line is None:
+            return
+        away = np.abs(places[left] @ line[:2] - line[2])
+        on_it = left[away < ON_PLANE * depths[left]]
+        seen_by = np.flatnonzero(np.bincount(views[on_it]) >= LEAST_VIEW_PX)
+        if len(seen_by) >= LEAST_VIEWS:
+            yield line, on_it, seen_by
+        left = left[away >= 2.0 * ON_PLANE * depths[left]]
 
 
 def _is_straight(
@@ -283,23 +297,15 @@ def _lines_on(
     flat, depths, views, pieces = _some(_MOST_PLACES, rng, flat, depths, views, pieces)
     centers = np.stack([look.view.center for look in seen])
     found, apart = [], [0.0]
-    for _ in range(_MOST_LINES):
-        line = best_line(flat, depths, views, pieces, rng)
-        if line is None:
-            break
-        away = np.abs(flat @ line[:2] - line[2])
-        on_it = away < ON_PLANE * depths
-        seen_by = np.flatnonzero(np.bincount(views[on_it]) >= LEAST_VIEW_PX)
-        s, h = flat[on_it][0]
+    for line, on_it, seen_by in _lines_of(_MOST_LINES, rng, flat, depths, views, pieces):
+        s, h = flat[on_it[0]]
         point = s * front.along + (h + front.level) * front.up
-        point += (front.plane[3] - point @ front.plane[:3]) * front.plane[:3]
+        point += front.plane[3] * front.plane[:3]
         direction = -line[1] * front.along + line[0] * front.up
         spread = spread_deg(centers[seen_by] - point, direction)
-        if len(seen_by) >= LEAST_VIEWS and spread >= _LEAST_EDGE_DEG:
+        if spread >= _LEAST_EDGE_DEG:
             found.append(line)
             apart.append(spread)
-        left = away >= 2.0 * ON_PLANE * depths
-        flat, depths, views, pieces = flat[left], depths[left], views[left], pieces[left]
     return np.array(found if max(apart) >= _LEAST_LINE_DEG else []).reshape(-1, 3)
 
 
