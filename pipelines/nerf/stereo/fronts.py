@@ -58,6 +58,9 @@ _ENDS, _BEHIND = 1.0, 0.1
 behind it, by its depth, the top tells of that, too."""
 _CLEAR = 0.05
 """How far above a floor an edge is, by its distance."""
+_MOST_BESIDE, _LEAST_BESIDE, _ALIKE_BRIGHT = 0.2, 0.004, 0.03
+"""A patch of which more than that lies beside the front is something else; and so is what is as
+bright as a plain patch of which so much, of the picture, lies there."""
 _CUT_PX = 3
 """Where a picture ends nothing else does: its own border is so far away at least."""
 _LEAST_ON = 0.5
@@ -160,10 +163,10 @@ def _edges_of_top(
         plane *= np.sign(np.median(centers[seen_by] @ plane[:3]) - plane[3]) or 1.0
         along = np.cross(normal, plane[:3])
         depth = float(np.median(depths[on_it]))
-        low, high = _ends(plane, along, places[on_it], known, depth)
-        front = Front(
-            plane, along, normal, float(low), float(high), float(top[3]), np.zeros((0, 3))
-        )
+        away = known @ plane[:3] - plane[3]
+        behind = known[(away < 0.0) & (away > -_BEHIND * depth)]
+        ends = _ends(places[on_it] @ along, views[on_it], behind @ along)
+        front = Front(plane, along, normal, *ends, float(top[3]), np.zeros((0, 3)))
         before = np.flatnonzero(centers @ plane[:3] > plane[3])
         if (
             len(np.intersect1d(seen_by, before)) >= LEAST_VIEWS
@@ -215,14 +218,15 @@ def _is_straight(
     return bool((away < 2.0 * ON_PLANE * depths[theirs]).mean() >= _LEAST_STRAIGHT)
 
 
-def _ends(plane: Floats, along: Floats, on_edge: Floats, known: Floats, depth: float) -> Floats:
-    """[2], from where to where an edge goes along it: as far as it was found, or the top is known
-    right behind it. on_edge, known: [K, 3], places of the edge and of the top."""
-    away = known @ plane[:3] - plane[3]
-    behind = known[(away < 0.0) & (away > -_BEHIND * depth)]
-    s = np.concatenate([on_edge, behind]) @ along
-    ends: Floats = np.percentile(s, (_ENDS, 100.0 - _ENDS))
-    return ends
+def _ends(along: Floats, views: Numbers, behind: Floats) -> tuple[float, float]:
+    """From where to where an edge goes: as far as any view has it, or the top is known behind it.
+
+    along: [K], of the places on it, of those views. behind: [M], of what is known of the top there.
+    """
+    seen = [along[views == view] for view in np.unique(views)]
+    parts = [part for part in (*seen, behind) if len(part) >= LEAST_VIEW_PX]
+    each = np.array([np.percentile(part, (_ENDS, 100.0 - _ENDS)) for part in parts])
+    return float(each[:, 0].min()), float(each[:, 1].max())
 
 
 def _overlap(one: Front, other: Front) -> bool:
@@ -338,6 +342,8 @@ def laid_on_fronts(look: Look, z: Depths, fronts: Sequence[Front], floors: Float
         lined = np.bincount(border.patch[on_line], minlength=num)
         agree = np.bincount(border.patch[on_line | on_edge], minlength=num)
         taken = (lined >= LEAST_VIEW_PX) & (agree >= _LEAST_ON * size)
+        if taken.any():
+            taken &= ~_goes_on_beside(front, look)
         if not taken.any():
             continue
         rows, columns = np.nonzero(taken[look.patches] & (look.view.picture >= 0.0))
@@ -350,3 +356,24 @@ def laid_on_fronts(look: Look, z: Depths, fronts: Sequence[Front], floors: Float
             may &= (ground <= 1e-9) | (inverse >= (1.0 - 2.0 * ON_PLANE) * ground)
         laid[rows[may], columns[may]] = depth[may].astype(np.float32)
     return laid
+
+
+def _goes_on_beside(front: Front, look: Look) -> Bools:
+    """[N]: patches that are as bright as a plain one beside the front: what is seen between the
+    legs of a table is seen beside them, too."""
+    usable = look.view.picture >= 0.0
+    rows, columns = np.nonzero(usable)
+    patch = look.patches[rows, columns]
+    depth, s, h = front.places(look, rows, columns)
+    below = front.is_below(depth, s, h)
+    beside = (depth > 0) & (h < 0.0) & ~below
+    num = int(look.patches.max()) + 1
+    size = np.maximum(np.bincount(patch, minlength=num), 1)
+    brightness = np.bincount(patch, look.view.picture[usable], num) / size
+    there = np.bincount(patch[beside], minlength=num)
+    is_other = np.bincount(patch[below], minlength=num) < 0.5 * size
+    is_other &= there > _LEAST_BESIDE * patch.size
+    others = look.plain[is_other[look.plain]]
+    alike = np.abs(brightness[:, None] - brightness[others]) < _ALIKE_BRIGHT
+    goes_on: Bools = (there > _MOST_BESIDE * size) | alike.any(axis=1)
+    return goes_on

@@ -58,3 +58,8 @@ def test_what_else_is_known_stays_as_it_was() -> None:
 def test_below_a_table_without_a_front_there_is_none(lines: bool) -> None:
     """Lines of the floor, seen past the edge, go elsewhere on the front's plane from every view."""
     assert white_known(walk(front=False, lines=lines))[0] < 0.02
+
+
+def test_between_the_legs_of_a_table_is_what_is_beside_them() -> None:
+    """They stand where the sides of a front would be, and hide the same of it from every view."""
+    assert white_known(walk(front=False, lines=False, legs=True))[0] < 0.02

@@ -39,15 +39,21 @@ class Seen:
         return DepthMap(z, np.where(z > 0, 4, 0).astype(np.uint8))
 
 
-def walk(*, front: bool = True, lines: bool = True, whole: bool = True) -> list[Seen]:
+LEG = 0.06
+
+
+def walk(
+    *, front: bool = True, lines: bool = True, whole: bool = True, legs: bool = False
+) -> list[Seen]:
     """Ten cameras that pass by, up and down a little. lines: on what is white. whole: whether the
-    pictures hold its ends and its foot."""
-    half, floor = (HALF, FLOOR) if whole else (3.0 * HALF, 2.0 * FLOOR)
+    pictures hold its ends and its foot. legs: two dark ones, below the ends of the near edge,
+    before a white floor and a white wall."""
+    half, floor = HALF if whole else 3.0 * HALF, FLOOR if whole and not legs else 2.0 * FLOOR
     eyes = [np.array([-0.5 + 0.11 * k, -0.1 - 0.12 * (k % 3), 0.1]) for k in range(10)]
-    return [look(eye, front, lines, half, floor) for eye in eyes]
+    return [look(eye, front, lines, half, floor, legs) for eye in eyes]
 
 
-def look(eye: Floats, front: bool, lines: bool, half: float, floor: float) -> Seen:
+def look(eye: Floats, front: bool, lines: bool, half: float, floor: float, legs: bool) -> Seen:
     """A camera that looks ahead and down by 20 degrees."""
     down = np.radians(20.0)
     cosine, sine = np.cos(down), np.sin(down)
@@ -62,7 +68,20 @@ def look(eye: Floats, front: bool, lines: bool, half: float, floor: float) -> Se
         _hits(eye, rays, 1, floor, lambda at: at[..., 2] < WALL),
         _hits(eye, rays, 2, WALL, lambda at: at[..., 1] < floor),
     ]
-    if not front:
+    if legs:
+        leg = _hits(
+            eye,
+            rays,
+            2,
+            FRONT,
+            lambda at: (
+                (np.abs(np.abs(at[..., 0]) - half + LEG) < LEG)
+                & (at[..., 1] > TOP)
+                & (at[..., 1] < floor)
+            ),
+        )
+        to[ON_FRONT] = leg
+    elif not front:
         to[ON_FRONT][:] = np.inf
     depth, what = np.min(to, axis=0), np.argmin(to, axis=0)
     place = eye + rays * depth[..., None]
@@ -70,7 +89,10 @@ def look(eye: Floats, front: bool, lines: bool, half: float, floor: float) -> Se
         12.0 * place[..., 2] + 9.0 * place[..., 1] + 2.0 * np.sin(9.0 * place[..., 0])
     )
     white = what == (ON_FRONT if front else ON_FLOOR)
-    picture = np.where(white, 0.95, pattern)
+    if legs:
+        white |= what == ON_WALL
+    dark = what == ON_FRONT if legs else np.zeros_like(white)
+    picture = np.where(dark, 0.15, np.where(white, 0.95, pattern))
     if lines:
         gaps = np.abs(place[..., 0][..., None] - [-0.75, 0.0, 0.75]).min(axis=-1) < LINE
         across = np.where(what == ON_FRONT, place[..., 1] - 0.85, place[..., 2] - 2.4)
