@@ -9,7 +9,7 @@ Symbols as in `stereo.planes`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,7 +115,7 @@ def ends_on(floor: int, looks: Sequence[Look]) -> tuple[Floats, Floats, Numbers,
     )
 
 
-def best_line(
+def _best_line(
     places: Floats, depths: Floats, views: Numbers, pieces: Numbers, rng: np.random.Generator
 ) -> Floats | None:
     """The line (a, b, c) with (a, b) . X = c and a^2 + b^2 = 1 that most views show, if any.
@@ -159,3 +159,43 @@ def spread_deg(to_centers: Floats, direction: Floats) -> float:
     normal = np.cross(to_centers, direction)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return float(np.degrees(np.arccos(np.clip(np.abs(normal @ normal.T).min(), 0.0, 1.0))))
+
+
+def lines_of(
+    most: int,
+    rng: np.random.Generator,
+    places: Floats,
+    depths: Floats,
+    views: Numbers,
+    pieces: Numbers,
+    on_line: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[Floats, Numbers, Numbers]]:
+    """Lines as `_best_line` finds them, one after the other among what the ones before have left;
+    of each the numbers of the places on it, and the views that see it."""
+    left = np.arange(len(places))
+    for _ in range(most):
+        on_line()
+        line = _best_line(places[left], depths[left], views[left], pieces[left], rng)
+        if line is None:
+            return
+        away = np.abs(places[left] @ line[:2] - line[2])
+        on_it = left[away < ON_PLANE * depths[left]]
+        seen_by = np.flatnonzero(np.bincount(views[on_it]) >= LEAST_VIEW_PX)
+        if len(seen_by) >= LEAST_VIEWS:
+            yield line, on_it, seen_by
+        left = left[away >= 2.0 * ON_PLANE * depths[left]]
+
+
+def some_of(most: int, rng: np.random.Generator, *arrays: Any) -> tuple[Any, ...]:
+    """At most so many places of all the arrays alike."""
+    if len(arrays[0]) <= most:
+        return arrays
+    chosen = rng.choice(len(arrays[0]), most, replace=False)
+    return tuple(array[chosen] for array in arrays)
+
+
+def axes_on(normal: Floats) -> Floats:
+    """[2, 3], unit: two axes on a plane, at right angles. normal: [3], the plane's."""
+    along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    along /= np.linalg.norm(along)
+    return np.stack([along, np.cross(normal, along)])

@@ -11,7 +11,7 @@ Depth is along the camera's axis (z), 0 where unknown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,9 +23,11 @@ from pipelines.nerf.stereo.borders import (
     LEAST_VIEW_PX,
     LEAST_VIEWS,
     Look,
-    best_line,
+    axes_on,
     edges_of,
     ends_on,
+    lines_of,
+    some_of,
     spread_deg,
 )
 from pipelines.nerf.stereo.planes import (
@@ -151,14 +153,12 @@ def _edges_of_top(
 
     known: [K, 3], some points of the top.
     """
-    places, depths, views, pieces = _some(_MOST_PLACES, rng, *ends_on(number, looks))
+    places, depths, views, pieces = some_of(_MOST_PLACES, rng, *ends_on(number, looks))
     normal, centers = top[:3], np.stack([look.view.center for look in looks])
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    first /= np.linalg.norm(first)
-    axes = np.stack([first, np.cross(normal, first)])
+    axes = axes_on(normal)
     flat = places @ axes.T
     found: list[tuple[Front, Numbers]] = []
-    for line, on_it, seen_by in _lines_of(_MOST_EDGES, rng, flat, depths, views, pieces, on_edge):
+    for line, on_it, seen_by in lines_of(_MOST_EDGES, rng, flat, depths, views, pieces, on_edge):
         plane = np.append(line[:2] @ axes, line[2])
         plane *= np.sign(np.median(centers[seen_by] @ plane[:3]) - plane[3]) or 1.0
         along = np.cross(normal, plane[:3])
@@ -177,31 +177,6 @@ def _edges_of_top(
         ):
             found.append((front, before))
     return found
-
-
-def _lines_of(
-    most: int,
-    rng: np.random.Generator,
-    places: Floats,
-    depths: Floats,
-    views: Numbers,
-    pieces: Numbers,
-    on_line: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[Floats, Numbers, Numbers]]:
-    """Lines as `best_line` finds them, one after the other among what the ones before have left;
-    of each the numbers of the places on it, and the views that see it."""
-    left = np.arange(len(places))
-    for _ in range(most):
-        on_line()
-        line = best_line(places[left], depths[left], views[left], pieces[left], rng)
-        if line is None:
-            return
-        away = np.abs(places[left] @ line[:2] - line[2])
-        on_it = left[away < ON_PLANE * depths[left]]
-        seen_by = np.flatnonzero(np.bincount(views[on_it]) >= LEAST_VIEW_PX)
-        if len(seen_by) >= LEAST_VIEWS:
-            yield line, on_it, seen_by
-        left = left[away >= 2.0 * ON_PLANE * depths[left]]
 
 
 def _is_straight(
@@ -298,10 +273,10 @@ def _lines_on(
     begun = np.cumsum([0, *(int(look.patches.max()) + 1 for look in seen)])
     pieces = np.concatenate([b.patch[at] for b, at in zip(borders, below, strict=True)])
     pieces = pieces + begun[views]
-    flat, depths, views, pieces = _some(_MOST_PLACES, rng, flat, depths, views, pieces)
+    flat, depths, views, pieces = some_of(_MOST_PLACES, rng, flat, depths, views, pieces)
     centers = np.stack([look.view.center for look in seen])
     found, apart = [], [0.0]
-    for line, on_it, seen_by in _lines_of(_MOST_LINES, rng, flat, depths, views, pieces):
+    for line, on_it, seen_by in lines_of(_MOST_LINES, rng, flat, depths, views, pieces):
         s, h = flat[on_it[0]]
         point = s * front.along + (h + front.level) * front.up
         point += front.plane[3] * front.plane[:3]
@@ -311,14 +286,6 @@ def _lines_on(
             found.append(line)
             apart.append(spread)
     return np.array(found if max(apart) >= _LEAST_LINE_DEG else []).reshape(-1, 3)
-
-
-def _some(most: int, rng: np.random.Generator, *arrays: Any) -> tuple[Any, ...]:
-    """At most so many places of all the arrays alike."""
-    if len(arrays[0]) <= most:
-        return arrays
-    chosen = rng.choice(len(arrays[0]), most, replace=False)
-    return tuple(array[chosen] for array in arrays)
 
 
 def laid_on_fronts(look: Look, z: Depths, fronts: Sequence[Front], floors: Floats) -> Depths:

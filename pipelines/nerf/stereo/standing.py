@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from pipelines.nerf.ahead import each_ahead
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.borders import (
-    LEAST_VIEW_PX,
-    LEAST_VIEWS,
     Look,
-    best_line,
+    axes_on,
     ends_on,
+    lines_of,
     look_at,
+    some_of,
     spread_deg,
 )
 from pipelines.nerf.stereo.completing import confirmed
@@ -115,9 +115,10 @@ def stood_up(
     )
     up = up_of(views) if up is None else up
     planes = planes[_is_level_or_upright(levels_of(up, planes))]
-    if not (np.abs(levels_of(up, planes)) >= LEVEL).any():
-        return maps
     floors = floors_of(up, planes, points, depths)
+    is_level = np.abs(levels_of(up, planes)) >= LEVEL
+    if not floors and not (config.hanging_fronts and is_level.any()):
+        return maps
 
     def look(index: int) -> Look:
         view = views[index]
@@ -195,36 +196,20 @@ def _find_walls(
     centers = np.stack([look.view.center for look in looks])
     walls = []
     for floor in floors:
-        places, depths, views, pieces = ends_on(floor, looks)
-        if len(places) > _MOST_ENDS:
-            some = rng.choice(len(places), _MOST_ENDS, replace=False)
-            places, depths, views, pieces = places[some], depths[some], views[some], pieces[some]
+        places, depths, views, pieces = some_of(_MOST_ENDS, rng, *ends_on(floor, looks))
         normal = planes[floor, :3]
-        along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-        along /= np.linalg.norm(along)
-        axes = np.stack([along, np.cross(normal, along)])
-        flat = places @ axes.T
-        for _ in range(_MOST_LINES):
-            on_line()
-            line = best_line(flat, depths, views, pieces, rng)
-            if line is None:
-                break
-            away = np.abs(flat @ line[:2] - line[2])
-            on_it = away < ON_PLANE * depths
-            seen_by = np.flatnonzero(np.bincount(views[on_it]) >= LEAST_VIEW_PX)
+        axes = axes_on(normal)
+        begun = places @ axes.T, depths, views, pieces
+        for line, on_it, seen_by in lines_of(_MOST_LINES, rng, *begun, on_line):
             facing = line[:2] @ axes
             plane = np.append(facing, line[2])
-            direction, point = np.cross(normal, facing), places[on_it][0]
+            to_centers = centers[seen_by] - places[on_it[0]]
             if (
-                len(seen_by) >= LEAST_VIEWS
-                and spread_deg(centers[seen_by] - point, direction) >= _LEAST_SPREAD_DEG
+                spread_deg(to_centers, np.cross(normal, facing)) >= _LEAST_SPREAD_DEG
                 and _share_behind(centers, plane) <= _BEHIND
             ):
-                some = np.flatnonzero(on_it)[:: max(1, int(on_it.sum()) // _MOST_PLACES)]
+                some = on_it[:: max(1, len(on_it) // _MOST_PLACES)]
                 walls.append(_Wall(plane, floor, places[some], depths[some]))
-            left = away >= 2.0 * ON_PLANE * depths
-            flat, depths, views, pieces = flat[left], depths[left], views[left], pieces[left]
-            places = places[left]
     return walls
 
 

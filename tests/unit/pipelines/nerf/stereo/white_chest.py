@@ -18,7 +18,8 @@ TOP, FLOOR, FRONT, WALL = 0.7, 1.5, 2.0, 2.9
 """y of the top and of the floor (down); z of the front and of the wall."""
 HALF = 1.0
 """Of the table's width, x."""
-LINE = 0.012
+LINE, LEG = 0.012, 0.06
+"""Half of the widths of a line and of a leg."""
 ON_TOP, ON_FRONT, ON_FLOOR, ON_WALL = range(4)
 
 Floats = NDArray[np.float64]
@@ -37,9 +38,6 @@ class Seen:
         """What stereo would know of it: what has a pattern."""
         z = np.where(self.white, np.float32(0.0), self.depth)
         return DepthMap(z, np.where(z > 0, 4, 0).astype(np.uint8))
-
-
-LEG = 0.06
 
 
 def walk(
