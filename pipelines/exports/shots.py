@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,12 +184,16 @@ class MixedStudio:
     ) -> Bytes:
         """[H, W, 3]: both."""
         full = intrinsics_of(lens)
-        around = full.model == "EQUIRECTANGULAR"
-        field = as_array(self._scene.render(full, pose, self._long_side(lens)).rgb)
+        around, side = full.model == "EQUIRECTANGULAR", self._long_side(lens)
         if self._mesh is None:
+            field = as_array(self._scene.render(full, pose, side).rgb)
             shown = enlarged(field, full.height, full.width, around=around)
-        else:
-            shown = mixed(field, self._mesh.view(full, pose), around=around)
+            return within(circle, as_uint8(shown))
+        # Rays to the mesh leave cores, or the GPU, idle now and then: both are drawn side by side.
+        with ThreadPoolExecutor(1) as pool:
+            seen = pool.submit(self._mesh.view, full, pose)
+            field = as_array(self._scene.render(full, pose, side).rgb)
+            shown = mixed(field, seen.result(), around=around)
         return within(circle, as_uint8(shown))
 
     def _long_side(self, lens: Pinhole | Intrinsics) -> int:

@@ -66,8 +66,11 @@ Numbers = NDArray[np.int64]
 _UPRIGHT = 0.1
 """Cosine, up to which planes stand."""
 _MOST_LINES, _MOST_ENDS = 12, 20_000
-_LEAST_SPREAD_DEG = 1.0
+_LEAST_SPREAD_DEG, _LEAST_OF_ENDS_DEG = 1.0, 0.5
+"""From how far apart cameras see a wall's foot; the latter where nothing is known behind it."""
 _BEHIND = 0.02
+_MOST_BEHIND = 0.01
+"""Of what is known, behind a wall that it ends at."""
 _BEYOND, _MOST_BEYOND, _MOST_PLACES = 0.06, 0.2, 200
 """No more of the floor so far beyond a wall's foot, by its depth, may be known, of what views could
 see of it."""
@@ -130,7 +133,8 @@ def stood_up(
         looks.append(found)
         share = (_LOOK_SHARE - _PLANES_SHARE) * (index + 1) / len(views)
         on_progress(_PLANES_SHARE + share, _MESSAGE)
-    walls = _find_walls(looks, planes, floors, lambda: on_progress(_LOOK_SHARE, _MESSAGE))
+    on_line = partial(on_progress, _LOOK_SHARE, _MESSAGE)
+    walls = _find_walls(looks, planes, floors, points, depths, on_line)
     walls = [wall for wall in walls if not _goes_on(views, depths_of(maps), wall)]
     fronts: list[Front] = []
     if config.hanging_fronts:
@@ -165,11 +169,16 @@ def stood_up(
     )
     if not walls:  # of a front nobody else learns: it has ends
         return laid
+    centers = np.stack([view.center for view in views])
+    handed_on = [
+        foot >= 0 or (abs(level) <= _UPRIGHT and _ends_all(plane, centers, points, depths))
+        for plane, foot, level in zip(every, stands_on, levels_of(up, every), strict=True)
+    ]
     return spread(
         looks,
         maps,
         laid,
-        every[np.array(stands_on) >= 0],
+        every[handed_on],
         neighbours,
         config,
         lambda done: on_progress(_SPREAD_SHARE + (1.0 - _SPREAD_SHARE) * done, _MESSAGE),
@@ -189,28 +198,46 @@ def _find_walls(
     looks: Sequence[Look],
     planes: Floats,
     floors: Sequence[int],
+    points: Floats,
+    depths: Floats,
     on_line: Callable[[], None] = lambda: None,
 ) -> list[_Wall]:
-    """Walls on the lines that floors end at. on_line: called before each is sought; may raise."""
+    """Walls on the lines that floors end at.
+
+    points: [N, 3], samples of what is known, with their depths [N]. on_line: called before each
+    line is sought; may raise.
+    """
     rng = np.random.default_rng(0)
     centers = np.stack([look.view.center for look in looks])
     walls = []
     for floor in floors:
-        places, depths, views, pieces = some_of(_MOST_ENDS, rng, *ends_on(floor, looks))
+        places, far, views, pieces = some_of(_MOST_ENDS, rng, *ends_on(floor, looks))
         normal = planes[floor, :3]
         axes = axes_on(normal)
-        begun = places @ axes.T, depths, views, pieces
+        begun = places @ axes.T, far, views, pieces
         for line, on_it, seen_by in lines_of(_MOST_LINES, rng, *begun, on_line):
             facing = line[:2] @ axes
             plane = np.append(facing, line[2])
-            to_centers = centers[seen_by] - places[on_it[0]]
-            if (
-                spread_deg(to_centers, np.cross(normal, facing)) >= _LEAST_SPREAD_DEG
-                and _share_behind(centers, plane) <= _BEHIND
+            if _share_behind(centers, plane) > _BEHIND:
+                continue
+            along = np.cross(normal, facing)
+            apart = spread_deg(centers[seen_by] - places[on_it[0]], along)
+            if apart >= _LEAST_SPREAD_DEG or (
+                apart >= _LEAST_OF_ENDS_DEG and _ends_all(plane, centers, points, depths)
             ):
                 some = on_it[:: max(1, len(on_it) // _MOST_PLACES)]
-                walls.append(_Wall(plane, floor, places[some], depths[some]))
+                walls.append(_Wall(plane, floor, places[some], far[some]))
     return walls
+
+
+def _ends_all(plane: Floats, centers: Floats, points: Floats, depths: Floats) -> bool:
+    """Whether about nothing is known behind an upright plane, as cameras see it.
+
+    points: [N, 3], samples of what is known, with their depths [N].
+    """
+    side = np.sign(np.median(centers @ plane[:3] - plane[3]))
+    behind = side * (points @ plane[:3] - plane[3]) < -2.0 * ON_PLANE * depths
+    return float(behind.mean()) <= _MOST_BEHIND
 
 
 def _share_behind(centers: Floats, plane: Floats) -> float:

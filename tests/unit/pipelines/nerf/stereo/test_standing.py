@@ -42,6 +42,41 @@ def test_a_blank_wall_stands_where_the_floor_ends() -> None:
     assert told[-1] == 1.0
 
 
+def still() -> list[tuple[float, float, float]]:
+    """Where eight cameras are that see the wall's foot from less than a degree apart."""
+    return [(-0.8 + 0.22 * i, -0.03 * (i % 3), 0.0) for i in range(8)]
+
+
+def way_through(seen: list[Seen]) -> list[DepthMap]:
+    """What is known where two of the views know something behind the blank wall, to the side."""
+    maps = [one.known() for one in seen]
+    for index in (2, 3):
+        maps[index] = with_known(seen[index], (slice(5, 45), slice(60, 110)), 1.5)
+    return maps
+
+
+def test_a_wall_that_ends_all_that_is_known_stands_for_who_hardly_moved() -> None:
+    """As for who turns in the middle of a room."""
+    seen = [look(place) for place in still()]
+    for one, after in zip(seen, stood(seen), strict=True):
+        wall = ~one.on_floor
+        there = wall & (after.z > 0)
+        assert there.sum() > 0.8 * wall.sum()
+        assert np.abs(after.z[there] / one.depth[there] - 1.0).max() < 0.02
+    maps = way_through(seen)
+    for before, after in zip(maps, stood(seen, maps), strict=True):
+        assert np.array_equal(before.z, after.z)
+
+
+def test_of_a_wall_that_is_seen_from_apart_something_may_be_known_behind() -> None:
+    """A door is open."""
+    seen = [look(place) for place in walk()]
+    maps = way_through(seen)
+    for index, after in enumerate(stood(seen, maps)):
+        if index not in (2, 3):
+            assert (after.z[~seen[index].on_floor] > 0).mean() > 0.5
+
+
 def test_a_corner_of_blank_walls_is_two_planes() -> None:
     """The cameras look along the floor's diagonal, so that its end is one line and then another."""
     seen = [look(place, turn=0.5 * (-1) ** i) for i, place in enumerate(walk())]
