@@ -97,7 +97,7 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                         "data": {"long_side_px": 480},
                         "optimizer": {**_FALLING_RATE, "lr": 0.015},
                     },
-                    "pointcloud": {"num_points": 200_000},
+                    "pointcloud": {"num_points": 500_000},
                     "mesh": {"render_long_side_px": 240},
                     "video": {
                         "turn_deg_per_s": 60,
@@ -128,7 +128,6 @@ PRESETS: types.MappingProxyType[str, Preset] = types.MappingProxyType(
                         "data": {"long_side_px": 800},
                         "optimizer": _FALLING_RATE,
                     },
-                    "pointcloud": {"num_points": 500_000},
                     "mesh": {
                         "resolution": 384,
                         "render_long_side_px": 480,

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.nerf.ahead import each_ahead
 from pipelines.scene.depth_views import DepthView
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 _DEPTH_TOLERANCE = 0.05
 _MAX_CONTRADICTED = 0.3
+_MOST_THREADS = 4
+"""Each holds some numbers of every point."""
 
 
 def consistent(points: Floats, views: Iterable[DepthView]) -> NDArray[np.bool_]:
@@ -25,24 +30,31 @@ def consistent(points: Floats, views: Iterable[DepthView]) -> NDArray[np.bool_]:
     """
     contradicted = np.zeros(len(points), np.int32)
     supported = np.zeros(len(points), np.int32)
-    for view in views:
-        lens = view.lens
-        matrix = view.camera_from_world_cv(np.zeros(3))
-        local = points @ matrix[:3, :3].T + matrix[:3, 3]
-        z = local[:, 2]
-        safe = np.where(z > 1e-9, z, np.inf)
-        u = np.floor(lens.fl_x * local[:, 0] / safe + lens.cx)
-        v = np.floor(lens.fl_y * local[:, 1] / safe + lens.cy)
-        inside = (z > 1e-9) & (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)
-        seen = np.flatnonzero(inside)
-        surface = _nearest_around(view.z_depth)[v[seen].astype(int), u[seen].astype(int)]
-        known = np.isfinite(surface)
-        seen, surface = seen[known], surface[known]
-        contradicted[seen] += z[seen] < surface * (1.0 - _DEPTH_TOLERANCE)
-        supported[seen] += np.abs(z[seen] - surface) <= surface * _DEPTH_TOLERANCE
+    for against, for_it in each_ahead(partial(_verdict, points), views, _MOST_THREADS):
+        contradicted[against] += 1
+        supported[for_it] += 1
     bad = (contradicted >= 2) & (contradicted > _MAX_CONTRADICTED * (contradicted + supported))
     fine: NDArray[np.bool_] = ~bad
     return fine
+
+
+def _verdict(points: Floats, view: DepthView) -> tuple[Indices, Indices]:
+    """Which points a view contradicts, and which it supports."""
+    lens = view.lens
+    matrix = view.camera_from_world_cv(np.zeros(3))
+    local = points @ matrix[:3, :3].T + matrix[:3, 3]
+    z = local[:, 2]
+    safe = np.where(z > 1e-9, z, np.inf)
+    u = np.floor(lens.fl_x * local[:, 0] / safe + lens.cx)
+    v = np.floor(lens.fl_y * local[:, 1] / safe + lens.cy)
+    inside = (z > 1e-9) & (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)
+    seen = np.flatnonzero(inside)
+    surface = _nearest_around(view.z_depth)[v[seen].astype(int), u[seen].astype(int)]
+    known = np.isfinite(surface)
+    seen, surface = seen[known], surface[known]
+    before = z[seen] < surface * (1.0 - _DEPTH_TOLERANCE)
+    beside = np.abs(z[seen] - surface) <= surface * _DEPTH_TOLERANCE
+    return seen[before], seen[beside]
 
 
 def _nearest_around(z_depth: NDArray[np.float32]) -> NDArray[np.float32]:
