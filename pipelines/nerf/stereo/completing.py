@@ -110,11 +110,14 @@ def confirmed(
     on_progress: Callable[[float], None],
     engine: Engine,
     kept: MapShelf,
+    patches: Callable[[int], Labels] | None = None,
 ) -> MapShelf:
     """The filled maps, as the maps were where neighbours refute a depth that is new, on `kept`.
 
     refutes: of the numbers of neighbours, [H, W] each, that agree and that see through.
-    on_progress: told the share that is done; may raise.
+    on_progress: told the share that is done; may raise. patches: of each view, [H, W], those that
+    are refuted as a whole where neighbours see through more of one than they agree on: beyond what
+    these show it would hang as a rag.
     """
     for index, found in enumerate(maps):
         votes, _ = votes_of_others(
@@ -123,6 +126,12 @@ def confirmed(
         moved = np.abs(filled[index] - found.z) > 2.0 * ON_PLANE * found.z
         guessed = (filled[index] > 0) & moved
         refuted = guessed & refutes(votes[AGREE], votes[SEE_THROUGH])
+        if patches is not None:
+            labels = patches(index)
+            num = int(labels.max()) + 1
+            through = np.bincount(labels[refuted & (votes[SEE_THROUGH] > 0)], minlength=num)
+            agreed = np.bincount(labels[guessed & ~refuted], minlength=num)
+            refuted |= guessed & (through > agreed)[labels]
         kept[index] = DepthMap(
             np.where(refuted, found.z, filled[index]),
             np.where(guessed & ~refuted, votes[AGREE], found.votes).astype(np.uint8),

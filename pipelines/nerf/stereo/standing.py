@@ -78,6 +78,9 @@ _SAME_DEG = 4.0
 _TOUCH_PX, _TOUCH_SHARE, _MOST_TOUCHED = 12, 0.12, 3
 _BENEATH_WEIGHT = 0.5
 _EXTRAPOLATED = 3.0
+_MORE_ASKED = 2
+"""So many times the neighbours that pictures are matched with are asked about walls: by the places
+that are known hardly one of them may show the far end of a plain wall."""
 _PLANES_SHARE, _LOOK_SHARE, _LAY_SHARE, _SPREAD_SHARE = 0.1, 0.35, 0.5, 0.75
 _MESSAGE = "standing walls up"
 
@@ -155,7 +158,8 @@ def stood_up(
         share = (_LAY_SHARE - _LOOK_SHARE) * (index + 1) / len(views)
         on_progress(_LOOK_SHARE + share, _MESSAGE)
     seen = surface_points(views, depths_of(maps))
-    neighbours = choose_neighbours(views, seen, config.num_neighbours, config.best_angle_deg)
+    count = _MORE_ASKED * config.num_neighbours
+    neighbours = choose_neighbours(views, seen, count, config.best_angle_deg)
     laid = confirmed(
         views,
         maps,
@@ -166,6 +170,7 @@ def stood_up(
         lambda done: on_progress(_LAY_SHARE + (_SPREAD_SHARE - _LAY_SHARE) * done, _MESSAGE),
         engine,
         MapShelf.kept(shelves, "walls", len(views), fresh=True),
+        lambda index: looks[index].patches,
     )
     if not walls:  # of a front nobody else learns: it has ends
         return laid
