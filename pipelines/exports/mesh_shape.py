@@ -30,6 +30,7 @@ from pipelines.exports.subject import Decision, Thing
 from pipelines.exports.subject_files import as_dict
 from pipelines.exports.subject_search import SEARCH_SHARE, look_at_one_place, search_subject
 from pipelines.exports.surface.carving import Seen, carved
+from pipelines.exports.surface.denoising import denoised
 from pipelines.exports.surface.holes import close_holes, hole_limits
 from pipelines.exports.surface.outlines import outlined
 from pipelines.exports.surface.refinement import refined
@@ -171,7 +172,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, plan: Plan, ctx: Stage
                 f"{len(plan.images)} views show no surface within the bounds that two agree on"
             )
         if options.refine == "photos":
-            mesh = _on_the_photos(mesh, scene, shells, options, ctx)
+            mesh = _on_the_photos(mesh, method, scene, shells, options, ctx)
         mesh = seamless(mesh, shells)
         told = ctx.told_part("closing holes", _MEND_SHARE, _CLOSED_SHARE)
         limits = hole_limits(shells, options.close_holes, options.max_distance)
@@ -224,13 +225,16 @@ def _fused(
 
 def _on_the_photos(
     mesh: TriangleMesh,
+    method: Method,
     scene: TrainedScene,
     shells: Sequence[Shell],
     options: MeshOptions,
     ctx: StageContext,
 ) -> TriangleMesh:
-    """The mesh moved onto what the training photos agree on."""
+    """The mesh moved onto what the training photos agree on, without the noise of its voxels."""
     told = ctx.told_part("refining", _FUSE_SHARE, _MEND_SHARE)
+    if method == "tsdf":
+        mesh = denoised(mesh, lambda done: told(0.0))
     return refined(
         mesh,
         _photos(stereo_view, scene, ctx, told),

@@ -70,7 +70,7 @@ def run(scene: TrainedScene, options: MeshOptions, ctx: StageContext) -> dict[st
 
 EXPORT = Export(
     kind="mesh",
-    version=32,
+    version=33,
     reads=("ingest", "frames", "depth"),
     run=run,
     options=MeshOptions,
