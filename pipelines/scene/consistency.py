@@ -16,8 +16,8 @@ Indices = NDArray[np.int64]
 
 _DEPTH_TOLERANCE = 0.05
 _MAX_CONTRADICTED = 0.3
-_MOST_THREADS = 4
-"""Each holds some numbers of every point."""
+_MOST_THREADS = 2
+"""Each holds some numbers of every point, 80 bytes or more."""
 
 
 def consistent(points: Floats, views: Iterable[DepthView]) -> NDArray[np.bool_]:
