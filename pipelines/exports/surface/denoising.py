@@ -33,7 +33,8 @@ _ANGLE_DEG = 25.0
 median, edges by 90. With 35 a right angle is rounded by a third of a voxel."""
 _NORMAL_ROUNDS, _VERTEX_ROUNDS = 10, 10
 _MOST_MOVED = 0.5
-"""Edges: 19 of 20 vertices go less far, and what would go farther is a spike, or thin."""
+"""Edges: 19 of 20 vertices go less far, and what would go farther is a spike, or
+thin, which this does not protect: a tube of less than four edges' width becomes rougher."""
 _PORTION = 100_000
 """Of the triangles at a time: each has about twelve beside it."""
 

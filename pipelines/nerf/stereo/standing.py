@@ -67,7 +67,7 @@ _UPRIGHT = 0.1
 """Cosine, up to which planes stand."""
 _MOST_LINES, _MOST_ENDS = 12, 20_000
 _LEAST_SPREAD_DEG, _LEAST_OF_ENDS_DEG = 1.0, 0.5
-"""From how far apart cameras see a wall's foot; the latter where nothing is known behind it."""
+"""From how far apart cameras see a wall's foot; the latter where about nothing is known behind."""
 _BEHIND = 0.02
 _MOST_BEHIND = 0.01
 """Of what is known, behind a wall that it ends at."""
@@ -236,10 +236,12 @@ def _find_walls(
 
 
 def _ends_all(plane: Floats, centers: Floats, points: Floats, depths: Floats) -> bool:
-    """Whether about nothing is known behind an upright plane, as cameras see it.
+    """Whether about nothing is known behind an upright plane that has cameras on one side alone.
 
     points: [N, 3], samples of what is known, with their depths [N].
     """
+    if _share_behind(centers, plane) > _BEHIND:
+        return False
     side = np.sign(np.median(centers @ plane[:3] - plane[3]))
     behind = side * (points @ plane[:3] - plane[3]) < -2.0 * ON_PLANE * depths
     return float(behind.mean()) <= _MOST_BEHIND
