@@ -189,7 +189,7 @@ class MixedStudio:
             field = as_array(self._scene.render(full, pose, side).rgb)
             shown = enlarged(field, full.height, full.width, around=around)
             return within(circle, as_uint8(shown))
-        # Rays to the mesh leave cores, or the GPU, idle now and then: both are drawn side by side.
+        # Looking colours up on the mesh keeps one core busy: the field is drawn meanwhile.
         with ThreadPoolExecutor(1) as pool:
             seen = pool.submit(self._mesh.view, full, pose)
             field = as_array(self._scene.render(full, pose, side).rgb)

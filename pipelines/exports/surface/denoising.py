@@ -33,8 +33,11 @@ _ANGLE_DEG = 25.0
 median, edges by 90. With 35 a right angle is rounded by a third of a voxel."""
 _NORMAL_ROUNDS, _VERTEX_ROUNDS = 10, 10
 _MOST_MOVED = 0.5
-"""Edges: 19 of 20 vertices go less far, and what would go farther is a spike, or
-thin, which this does not protect: a tube of less than four edges' width becomes rougher."""
+"""Edges: 19 of 20 vertices go less far, and what would go farther is a spike."""
+_SHEET_ROUNDS = 5
+_THIN, _FOLDED = 0.47, 0.57
+"""Length of the mean normal around a vertex, so many rings: about a tube three edges wide at most,
+and along a noisy fold of a right angle at least. In between moves fade."""
 _PORTION = 100_000
 """Of the triangles at a time: each has about twelve beside it."""
 
@@ -66,6 +69,7 @@ def denoised(
                 for first in range(0, len(faces), _PORTION)
             ]
         )
+    del beside  # the largest of all
     corner, face = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
     around = np.maximum(np.bincount(corner, minlength=len(vertices)), 1)[:, None]
     for done in range(_NORMAL_ROUNDS, rounds):
@@ -75,11 +79,19 @@ def denoised(
         moves = _sums(corner, way * normals[face], len(vertices)) / around
         moves[rings.on_border] = 0.0
         vertices = vertices + moves
-    moves = vertices - begun
+    moves = _sheet(begun, rings)[:, None] * (vertices - begun)
     length = np.linalg.norm(moves, axis=1)
     vertices = begun + np.minimum(1.0, farthest / np.maximum(length, 1e-30))[:, None] * moves
     on_progress(1.0)
     return replace(mesh, vertices=vertices + origin, normals=rings.normals(vertices))
+
+
+def _sheet(vertices: Floats, rings: MeshRings) -> Floats:
+    """[V] in [0, 1]: 1 where the surface around a vertex is a sheet, folded at most, and 0 where it
+    closes around something thin, which would become facets."""
+    straight = rings.straightness(vertices, _SHEET_ROUNDS)
+    sheet: Floats = np.clip((straight - _THIN) / (_FOLDED - _THIN), 0.0, 1.0)
+    return sheet
 
 
 def _touching(faces: NDArray[np.integer[Any]], num_vertices: int) -> csr_array:

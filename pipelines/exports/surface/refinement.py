@@ -173,10 +173,7 @@ def _seen(
 
 def _sharpness(vertices: Floats, rings: MeshRings) -> Floats:
     """[V] in [0, 1]: 0 where the surface is about flat, 1 at its edges and open borders."""
-    total, area = rings.crossed(vertices)
-    for _ in range(_NORMAL_ROUNDS):
-        total, area = total + rings.around @ total, area + rings.around @ area
-    straight = np.linalg.norm(total, axis=1) / np.maximum(area, 1e-30)
+    straight = rings.straightness(vertices, _NORMAL_ROUNDS)
     sharp: Floats = np.clip((_STRAIGHT - straight) / (_STRAIGHT - _BENT), 0.0, 1.0)
     sharp[rings.on_border] = 1.0
     return sharp

@@ -75,6 +75,14 @@ class MeshRings:
                 total[:, axis] += np.bincount(corner, across[:, axis], len(vertices))
         return total, area
 
+    def straightness(self, vertices: Floats, rounds: int) -> Floats:
+        """[V]: the length of the mean normal around each, about so many edges far: 1 on a plane."""
+        total, area = self.crossed(vertices)
+        for _ in range(rounds):
+            total, area = total + self.around @ total, area + self.around @ area
+        straight: Floats = np.linalg.norm(total, axis=1) / np.maximum(area, 1e-30)
+        return straight
+
     def normals(self, vertices: Floats) -> Floats:
         """[V, 3], unit: the mean of the faces around each, by area."""
         return unit_normals(self.crossed(vertices)[0])

@@ -112,9 +112,9 @@ def stood_up(
     fronts below tops.
 
     Pixels of plain patches change that are unknown, or seem to be nearer than the wall: they get
-    its depth where a neighbour agrees and none sees through it, or twice as many agree. patches: a
-    shelf for the pictures' `patches_of`, or with them. up: [3], unit, where it is known better than
-    pictures tell.
+    its depth where a neighbour agrees and none sees through it, or twice as many agree, unless more
+    of the patch is seen through than agreed on. patches: a shelf for the pictures' `patches_of`, or
+    with them. up: [3], unit, where it is known better than pictures tell.
     """
     planes, points, depths = planes_and_samples(
         views, maps, lambda done: on_progress(_PLANES_SHARE * done, _MESSAGE)

@@ -82,6 +82,42 @@ def test_open_borders_stay() -> None:
     assert (moved[~border] > 1e-4).mean() > 0.9
 
 
+def tube(radius: float, noise: float) -> tuple[TriangleMesh, Floats]:
+    """Around z, of edges about 1 long, and how far each inner vertex is from its axis."""
+    around, length = round(2.0 * np.pi * radius), 40
+    turn, z = np.meshgrid(np.arange(around), np.arange(length), indexing="ij")
+    angle = 2.0 * np.pi * turn / around
+    at = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).reshape(-1, 3)
+    at += np.random.default_rng(0).normal(0.0, noise, at.shape)
+    a, b = ((some[:, :-1] % around * length + z[:, :-1]).ravel() for some in (turn, turn + 1))
+    faces = np.concatenate([np.stack([a, b, b + 1], 1), np.stack([a, b + 1, a + 1], 1)])
+    mesh = TriangleMesh(at, faces.astype(np.int32), np.zeros_like(at), np.zeros_like(at))
+    return mesh, roughness(mesh, radius)
+
+
+def roughness(mesh: TriangleMesh, radius: float) -> Floats:
+    _, _, z = mesh.vertices.T
+    away: Floats = np.hypot(*mesh.vertices.T[:2]) - radius
+    return away[(z > 5.0) & (z < 34.0)]
+
+
+@pytest.mark.parametrize(("radius", "of_before"), [(1.0, 1.05), (1.5, 1.05), (3.0, 0.5)])
+def test_legs_of_chairs_are_not_made_facets(radius: float, of_before: float) -> None:
+    """What is thin stays as it is, what is thick becomes smooth."""
+    before, rough = tube(radius, 0.1)
+    after = roughness(denoised(before), radius)
+    assert np.sqrt((rough**2).mean()) > 0.08
+    assert np.sqrt((after**2).mean()) < of_before * np.sqrt((rough**2).mean())
+
+
+def test_no_vertex_goes_farther_than_half_an_edge() -> None:
+    before = step(0.6 * VOXEL)
+    moved = np.linalg.norm(denoised(before).vertices - before.vertices, axis=1)
+    edges = MeshRings(before.faces, len(before.vertices)).edge_lengths(before.vertices)
+    assert (moved > 0.45 * edges).any()
+    assert (moved < 0.501 * edges).all()
+
+
 def test_portions_of_the_triangles_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = denoised(step())
     monkeypatch.setattr(denoising, "_PORTION", 997)
