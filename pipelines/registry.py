@@ -89,7 +89,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         name="depth",
-        version=19,
+        version=20,
         after=("poses",),
         reads=("ingest", "frames", "poses"),
         run="pipelines.stages.depth:run",

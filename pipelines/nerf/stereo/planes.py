@@ -13,6 +13,7 @@ camera's axis (z), 0 where unknown.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,10 @@ ON_PLANE, _ALIGNED = 0.01, 0.9
 """How near a point is to its plane, relative to its depth; |cosine| between their normals."""
 _MOST_PLANES, _HYPOTHESES, _LEAST_SHARE = 24, 300, 0.01
 _MIN_KNOWN, _MIN_SHARE = 30, 0.5
+ON_A_LINE, _OF_PATCH, _WELL_KNOWN = 0.1, 0.3, 0.3
+"""Places are on a line up to this ratio of their axes. What is known of a patch along one line, as
+the next wall is in their corner, says nothing of it, unless the patch is little rounder itself, or
+that is so much of it."""
 LEVEL = 0.8
 """A plane is about level from this cosine between its normal and up on."""
 _BELOW, _MOST_BELOW = 0.03, 0.02
@@ -109,7 +114,7 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats, patches: Labels)
     """A depth map [H, W] whose patches lie on the planes that their known pixels lie on.
 
     planes: [P, 4]. patches: [H, W], of the picture. A patch goes to the plane that most of its
-    known pixels are within 2 % of, if half of them are.
+    known pixels are within 2 % of, if half of them are and they are not all on one line.
     """
     offsets = planes[:, 3] - planes[:, :3] @ view.center
     apart = np.abs(offsets) > 1e-9
@@ -137,6 +142,14 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats, patches: Labels)
     chosen = turned[num_near.argmax(axis=-1)][patches]
     found = x * chosen[..., 0] + y[:, None] * chosen[..., 1] + chosen[..., 2]
     supported = near(found)
+    columns, rows = np.broadcast_arrays(x, y[:, None])
+    across, of_patch = (
+        roundness(patches[at], columns[at], rows[at], num_patches)
+        for at in (supported, np.ones_like(supported))
+    )
+    on_a_line = across <= np.minimum(ON_A_LINE, _OF_PATCH * of_patch)
+    num_pixels = np.bincount(patches.ravel(), minlength=num_patches)
+    decided &= ~on_a_line | (num_known > _WELL_KNOWN * num_pixels)
     nearest, farthest = np.zeros(num_patches), np.full(num_patches, np.inf)
     np.maximum.at(nearest, patches[supported], inverse[supported])
     np.minimum.at(farthest, patches[supported], inverse[supported])
@@ -147,6 +160,25 @@ def laid_on_planes(view: StereoView, z: Depths, planes: Floats, patches: Labels)
     taken = decided[patches] & (fills | moves)
     laid: Depths = np.where(taken, 1.0 / np.where(taken, found, 1.0), z).astype(np.float32)
     return laid
+
+
+def roundness(labels: NDArray[np.integer[Any]], x: Floats, y: Floats, num: int) -> Floats:
+    """[num]: of the places (x, y) [K] with each label from 0 on, the shorter of their axes by the
+    longer one, in [0, 1]; 0 where all are on a line, or none is.
+    """
+    count = np.maximum(np.bincount(labels, minlength=num), 1)
+
+    def mean(values: Floats) -> Floats:
+        return np.bincount(labels, values, num) / count
+
+    middle_x, middle_y = mean(x), mean(y)
+    x, y = x - middle_x[labels], y - middle_y[labels]
+    xx, yy, xy = mean(x * x), mean(y * y), mean(x * y)
+    half = np.hypot((xx - yy) / 2.0, xy)
+    longer = (xx + yy) / 2.0 + half
+    shorter = np.maximum((xx + yy) / 2.0 - half, 0.0)
+    ratio: Floats = np.sqrt(shorter / np.maximum(longer, 1e-30))
+    return ratio
 
 
 def inverse_depths(view: StereoView, planes: Floats, x: Floats, y: Floats) -> Floats:

@@ -10,6 +10,9 @@ about level, below which nothing is known, as the edge of a table is just such a
 backdrop. No wall has cameras on both of its sides. Walls at right angles to floors: Furukawa,
 Curless, Seitz, Szeliski, "Manhattan-world stereo", CVPR 2009.
 
+Who films what hangs on a wall sees no floor. Where surfaces tell of a wall, and it ends the place,
+the plain patches around what is known of it are that wall, too.
+
 Symbols as in `stereo.planes`: planes [P, 4] (n, d) with n . X = d, n of length 1, in the world.
 Depth is along the camera's axis (z), 0 where unknown.
 """
@@ -42,6 +45,7 @@ from pipelines.nerf.stereo.neighbours import choose_neighbours
 from pipelines.nerf.stereo.patches import even_patches, shelved_patches
 from pipelines.nerf.stereo.planes import (
     LEVEL,
+    ON_A_LINE,
     ON_PLANE,
     Floats,
     floors_of,
@@ -49,6 +53,7 @@ from pipelines.nerf.stereo.planes import (
     levels_of,
     planes_and_samples,
     ray_grid,
+    roundness,
     up_of,
 )
 from pipelines.nerf.stereo.shelves import MEMORY, ByView, Shelf, Shelves
@@ -69,13 +74,16 @@ _MOST_LINES, _MOST_ENDS = 12, 20_000
 _LEAST_SPREAD_DEG, _LEAST_OF_ENDS_DEG = 1.0, 0.5
 """From how far apart cameras see a wall's foot; the latter where about nothing is known behind."""
 _BEHIND = 0.02
-_MOST_BEHIND = 0.01
-"""Of what is known, behind a wall that it ends at."""
+_MOST_BEHIND, _BEHIND_OF_WALL = 0.01, 0.3
+"""Of what is known, behind a wall that it ends at; or of what lies on the wall: what gleams on it,
+or is seen in a glass, seems to be behind."""
 _BEYOND, _MOST_BEYOND, _MOST_PLACES = 0.06, 0.2, 200
 """No more of the floor so far beyond a wall's foot, by its depth, may be known, of what views could
 see of it."""
 _SAME_DEG = 4.0
 _TOUCH_PX, _TOUCH_SHARE, _MOST_TOUCHED = 12, 0.12, 3
+_RIM_PX, _LEAST_OF_WALL = 3, 0.01
+"""What a wall has around itself reaches the picture's rim and is so much of the picture."""
 _BENEATH_WEIGHT = 0.5
 _EXTRAPOLATED = 3.0
 _MORE_ASKED = 2
@@ -108,8 +116,8 @@ def stood_up(
     *,
     up: Floats | None = None,
 ) -> MapShelf:
-    """The maps with plain patches on the walls that their borders with the floor tell of, and on
-    fronts below tops.
+    """The maps with plain patches on the walls that their borders with the floor tell of, on known
+    walls that end the place, and on fronts below tops.
 
     Pixels of plain patches change that are unknown, or seem to be nearer than the wall: they get
     its depth where a neighbour agrees and none sees through it, or twice as many agree, unless more
@@ -122,8 +130,14 @@ def stood_up(
     up = up_of(views) if up is None else up
     planes = planes[_is_level_or_upright(levels_of(up, planes))]
     floors = floors_of(up, planes, points, depths)
-    is_level = np.abs(levels_of(up, planes)) >= LEVEL
-    if not floors and not (config.hanging_fronts and is_level.any()):
+    levels = np.abs(levels_of(up, planes))
+    centers = np.stack([view.center for view in views])
+    ends = [
+        level <= _UPRIGHT and _ends_all(plane, centers, points, depths)
+        for plane, level in zip(planes, levels, strict=True)
+    ]
+    has_tops = config.hanging_fronts and bool((levels >= LEVEL).any())
+    if not (floors or has_tops or any(ends)):
         return maps
 
     def look(index: int) -> Look:
@@ -144,14 +158,15 @@ def stood_up(
         known = planes, points, depths
         on_edge = partial(on_progress, _LOOK_SHARE, _MESSAGE)
         fronts = find_fronts(looks, depths_of(maps), up, *known, on_edge)
-    if not walls and not fronts:
+    if not (walls or fronts or any(ends)):
         return maps
     every, stands_on = _with_walls(planes, walls, float(np.median(depths)))
+    ending = np.pad(np.array(ends, np.bool_), (0, len(every) - len(ends)))
     filled = shelves.scratch("on walls", len(views))
 
     def lay(index: int) -> None:
         z = maps[index].z
-        laid = _laid(looks[index], z, every, stands_on) if walls else z
+        laid = _laid(looks[index], z, every, stands_on, ending) if walls or any(ends) else z
         filled[index] = laid_on_fronts(looks[index], laid, fronts, planes[floors])
 
     for index, _ in enumerate(each_ahead(lay, range(len(views)))):
@@ -172,13 +187,9 @@ def stood_up(
         MapShelf.kept(shelves, "walls", len(views), fresh=True),
         lambda index: looks[index].patches,
     )
-    if not walls:  # of a front nobody else learns: it has ends
+    handed_on = ending | (np.array(stands_on) >= 0)
+    if not handed_on.any():  # of a front nobody else learns: it has ends
         return laid
-    centers = np.stack([view.center for view in views])
-    handed_on = [
-        foot >= 0 or (abs(level) <= _UPRIGHT and _ends_all(plane, centers, points, depths))
-        for plane, foot, level in zip(every, stands_on, levels_of(up, every), strict=True)
-    ]
     return spread(
         looks,
         maps,
@@ -236,15 +247,16 @@ def _find_walls(
 
 
 def _ends_all(plane: Floats, centers: Floats, points: Floats, depths: Floats) -> bool:
-    """Whether about nothing is known behind an upright plane that has cameras on one side alone.
+    """Whether hardly anything is known behind an upright plane with cameras on one side alone.
 
     points: [N, 3], samples of what is known, with their depths [N].
     """
     if _share_behind(centers, plane) > _BEHIND:
         return False
     side = np.sign(np.median(centers @ plane[:3] - plane[3]))
-    behind = side * (points @ plane[:3] - plane[3]) < -2.0 * ON_PLANE * depths
-    return float(behind.mean()) <= _MOST_BEHIND
+    before = side * (points @ plane[:3] - plane[3]) / depths
+    behind, on_it = before < -2.0 * ON_PLANE, np.abs(before) < ON_PLANE
+    return float(behind.mean()) <= max(_MOST_BEHIND, _BEHIND_OF_WALL * float(on_it.mean()))
 
 
 def _share_behind(centers: Floats, plane: Floats) -> float:
@@ -288,23 +300,32 @@ def _with_walls(planes: Floats, walls: Sequence[_Wall], depth: float) -> tuple[F
     return np.array(every), stands_on
 
 
-def _laid(look: Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> Depths:
+def _laid(look: Look, z: Depths, planes: Floats, stands_on: Sequence[int], ending: Bools) -> Depths:
     """The map [H, W] with its open patches on the planes that their borders touch.
 
-    planes: [P, 4], those known and the walls. stands_on: of each the floor, or -1. A border touches
-    a plane where the depth that is known next to it is the plane's; next to the plane itself that
-    says nothing, as plain things before a floor have floor all around them.
+    planes: [P, 4], those known and the walls. stands_on: of each the floor, or -1. ending: [P],
+    known walls that end the place. A border touches a plane where the depth that is known next to
+    it is the plane's; next to the plane itself that says nothing, as plain things before a floor
+    have floor all around them, but of a patch that a wall that ends the place has around itself.
+    Where no wall stands on a floor only these are laid.
     Where several planes are touched the patch is a corner: the nearer of them all over, as inside
     of a room, or the farther, as outside of a box, whichever more of the border agrees with.
     """
     laid = z.copy()
     pixels = ray_grid(look.view)
+    is_large = np.bincount(look.patches.ravel()) >= _LEAST_OF_WALL * look.patches.size
+    at_rim = np.unique(look.patches[_is_rim(look.view.picture >= 0.0)])
     for patch in np.intersect1d(look.plain, look.patch):
         at = look.patch == patch
         depth, own = look.z[at], look.plane[at]
         relative = inverse_depths(look.view, planes, look.x[at], look.y[at]) * depth
         touches = np.abs(relative - 1.0) < 2.0 * ON_PLANE
-        touches[own[own >= 0], np.flatnonzero(own >= 0)] = False
+        around = _goes_around(look.x[at], look.y[at], own, ending)
+        around &= bool(is_large[patch]) and patch in at_rim
+        if max(stands_on) < 0 and not around.any():
+            continue
+        says_nothing = (own >= 0) & ~around[own]
+        touches[own[says_nothing], np.flatnonzero(says_nothing)] = False
         beneath = (relative < 1.0 - 2.0 * ON_PLANE) & (own == np.array(stands_on)[:, None])
         beneath &= own >= 0
         chosen = _touched(touches, relative, beneath)
@@ -324,6 +345,27 @@ def _laid(look: Look, z: Depths, planes: Floats, stands_on: Sequence[int]) -> De
             fits &= (ground <= 1e-9) | (found >= (1.0 - 2.0 * ON_PLANE) * ground)
         laid[fits] = (1.0 / found[fits]).astype(np.float32)
     return laid
+
+
+def _is_rim(usable: Bools) -> Bools:
+    """[H, W]: the usable pixels that have one beyond the picture or of no use some pixels away."""
+    reach = _RIM_PX
+    padded = np.pad(usable, reach)
+    inner = padded[reach:-reach, 2 * reach :] & padded[reach:-reach, : -2 * reach]
+    inner &= padded[2 * reach :, reach:-reach] & padded[: -2 * reach, reach:-reach]
+    return usable & ~inner
+
+
+def _goes_around(x: Floats, y: Floats, own: Numbers, ending: Bools) -> Bools:
+    """[P]: of walls that end the place, those that a border is next to not along one line alone,
+    as the border of the next wall is.
+
+    x, y, own: [K], places of the border, and the planes that are next to them, or -1.
+    """
+    on = own >= 0
+    enough = np.bincount(own[on], minlength=len(ending)) >= _TOUCH_PX
+    around: Bools = ending & enough & (roundness(own[on], x[on], y[on], len(ending)) > ON_A_LINE)
+    return around
 
 
 def _farther(inverse: Floats) -> Floats:

@@ -35,11 +35,13 @@ def look(
     turn: float = 0.0,
     backdrop: float = WALL,
     box: tuple[float, float] | None = None,
+    hung: tuple[float, float, float, float] | None = None,
 ) -> Seen:
     """A camera at a place, 12 degrees down, turned to the right by so many radians.
 
     backdrop: z of what is blank behind the floor, which ends at `WALL`. box: a blank board that
-    hangs before the floor, upright, at that z and up to that y.
+    hangs before the floor, upright, at that z and up to that y. hung: from x to x and from y to y,
+    a patterned picture flat on the backdrop.
     """
     down = np.radians(12.0)
     tilt = np.array(
@@ -64,6 +66,11 @@ def look(
         8.0 * place[..., 2]
     )
     picture = np.where(on_floor, pattern, 0.9 + 0.03 * x[None, :])
+    if hung is not None:
+        shows = is_hung(eye + rays * to_blank[..., None], hung) & ~on_floor
+        place = eye + rays * np.where(shows, to_blank, 0.0)[..., None]
+        painted = 0.45 + 0.3 * np.sin(11.0 * place[..., 0]) * np.cos(9.0 * place[..., 1])
+        picture = np.where(shows, painted, picture)
     if box is not None:
         to_box = np.where(rays[..., 2] > 1e-6, (box[0] - eye[2]) / rays[..., 2], np.inf)
         hit = eye + rays * np.where(np.isfinite(to_box), to_box, 0.0)[..., None]
@@ -74,6 +81,16 @@ def look(
     pose = np.column_stack([rotation, eye])
     view = StereoView(picture.astype(np.float32), (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), pose)
     return Seen(view, np.where(np.isfinite(depth), depth, 0.0).astype(np.float32), on_floor)
+
+
+def is_hung(
+    places: NDArray[np.float64], hung: tuple[float, float, float, float]
+) -> NDArray[np.bool_]:
+    """Which places [..., 3] on the backdrop are the picture's."""
+    low_x, high_x, low_y, high_y = hung
+    x, y = places[..., 0], places[..., 1]
+    shows: NDArray[np.bool_] = (low_x < x) & (x < high_x) & (low_y < y) & (y < high_y)
+    return shows
 
 
 def walk() -> list[tuple[float, float, float]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.completing import completed
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
-from pipelines.nerf.stereo.planes import planes_and_samples
+from pipelines.nerf.stereo.planes import planes_and_samples, roundness
 from pipelines.nerf.stereo.views import StereoView
 from tests.unit.pipelines.nerf.stereo.painted_wall import BOX, SLOPE, WALL, row_of_cameras
 
@@ -68,6 +68,30 @@ def test_a_blank_patch_lies_on_the_plane_of_its_borders() -> None:
         assert (after.votes[middle & (after.z > 0)] > 0).mean() > 0.5
         kept = before.z > 0
         assert np.abs(after.z[kept] / before.z[kept] - 1.0).max() <= 0.0101
+
+
+@pytest.mark.parametrize(("known", "is_laid"), [("one side", False), ("two sides", True)])
+def test_what_is_known_along_one_line_says_nothing_of_a_patch(known: str, is_laid: bool) -> None:
+    """In the corner of two walls some of the one seems to be known on the other."""
+    views, depths, _ = blank_wall()
+    blank = [view.picture == np.float32(0.9) for view in views]
+    unknown = []
+    for patch in blank:
+        rows, columns = np.nonzero(patch)
+        left = np.arange(patch.shape[1])[None, :] < columns.min() + 5
+        top = np.arange(patch.shape[0])[:, None] < rows.min() + 5
+        unknown.append(patch & ~(left | top if known == "two sides" else left))
+    found = completed(views, MapShelf.of(maps_without(depths, unknown)), CONFIG)
+    shares = [(after.z[hidden] > 0).mean() for after, hidden in zip(found, unknown, strict=True)]
+    assert (np.mean(shares) > 0.8) if is_laid else (max(shares) < 0.06)
+
+
+def test_places_on_a_line_are_not_round() -> None:
+    turn = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    labels = np.repeat([0, 1, 3], 60)
+    x = np.concatenate([np.cos(turn), turn, 5.0 + 3.0 * np.cos(turn)])
+    y = np.concatenate([np.sin(turn), 2.0 - turn, 7.0 + np.sin(turn)])
+    assert np.allclose(roundness(labels, x, y, 5), [1.0, 0.0, 0.0, 1.0 / 3.0, 0.0], atol=1e-6)
 
 
 def test_depths_near_their_plane_become_flat_and_others_stay() -> None:

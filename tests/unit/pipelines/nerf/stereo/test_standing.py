@@ -10,7 +10,7 @@ import pytest
 from pipelines.nerf.options.stereo import StereoConfig
 from pipelines.nerf.stereo.maps import DepthMap, MapShelf
 from pipelines.nerf.stereo.planes import up_of
-from pipelines.nerf.stereo.standing import _is_level_or_upright, stood_up
+from pipelines.nerf.stereo.standing import _goes_around, _is_level_or_upright, stood_up
 from tests.unit.pipelines.nerf.stereo.blank_room import WALL, Seen, look, walk
 
 CONFIG = StereoConfig(num_neighbours=5)
@@ -195,6 +195,73 @@ def test_what_seems_to_stand_before_a_plain_wall_goes_back_onto_it() -> None:
     # Something farther is a way through, and stays.
     maps[3] = with_known(seen[3], halo, 1.3)
     assert np.array_equal(stood(seen, maps)[3].z[halo], maps[3].z[halo])
+
+
+HUNG = (-0.7, 0.5, -0.6, 0.3)
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def before_a_wall(box: tuple[float, float] | None = None) -> list[Seen]:
+    """What hangs on a blank wall, filmed so that no floor is seen."""
+    places = [(-0.4 + 0.12 * i, -0.5 - 0.1 * (i % 3), 1.6 + 0.05 * i) for i in range(8)]
+    return [look(place, hung=HUNG, box=box) for place in places]
+
+
+def known_of(one: Seen, where: np.ndarray, factor: float = 1.0) -> DepthMap:
+    """A view of which its true depth times a factor is known there [H, W], and nothing else."""
+    z = np.where(where, factor * one.depth, 0.0).astype(np.float32)
+    return DepthMap(z, np.where(where, 4, 0).astype(np.uint8))
+
+
+def stood_without_floor(seen: list[Seen], maps: list[DepthMap]) -> list[DepthMap]:
+    return list(stood_up([one.view for one in seen], MapShelf.of(maps), CONFIG, up=UP))
+
+
+def test_a_blank_wall_goes_on_around_what_hangs_on_it() -> None:
+    """The wall is known by the picture on it alone, and no floor is seen."""
+    seen = before_a_wall()
+    assert not any(one.on_floor.any() for one in seen)
+    pictures = [one.view.picture < 0.8 for one in seen]
+    maps = [known_of(one, picture) for one, picture in zip(seen, pictures, strict=True)]
+    for one, picture, after in zip(seen, pictures, stood_without_floor(seen, maps), strict=True):
+        assert 0.04 < picture.mean() < 0.5
+        there = after.z > 0
+        assert there[~picture].mean() > 0.85
+        assert np.abs(after.z[there] / one.depth[there] - 1.0).max() < 0.02
+        assert (after.votes[there] >= 1).all()
+
+
+def test_a_surface_with_much_behind_it_is_no_wall_that_goes_on() -> None:
+    """As the front of a cupboard, which ends somewhere."""
+    seen = before_a_wall()
+    maps = [known_of(one, one.view.picture < 0.8) for one in seen]
+    for one, found in zip(seen, maps, strict=True):
+        found.z[:, -40:] = 1.5 * one.depth[:, -40:]
+        found.votes[:, -40:] = 4
+    for before, after in zip(maps, stood_without_floor(seen, maps), strict=True):
+        assert np.array_equal(before.z, after.z)
+
+
+def test_what_hangs_free_before_a_known_wall_is_not_laid_on_it() -> None:
+    """The wall is all around the blank board, which reaches no rim of the pictures."""
+    seen = before_a_wall(box=(3.4, 0.3))
+    boards = [one.view.picture == np.float32(0.15) for one in seen]
+    maps = [known_of(one, ~board) for one, board in zip(seen, boards, strict=True)]
+    for board, after in zip(boards, stood_without_floor(seen, maps), strict=True):
+        assert board.sum() > 300
+        assert not after.z[board].any()
+
+
+def test_a_wall_that_is_next_to_a_patch_along_one_line_is_not_around_it() -> None:
+    """That is the border of the next wall."""
+    ending, along = np.array([True, False]), np.arange(20.0)
+    own = np.zeros(40, np.int64)
+    corner = np.concatenate([along, along]), np.concatenate([2.0 * along, 2.0 * along + 0.5])
+    around = np.concatenate([along, 0.0 * along]), np.concatenate([0.0 * along, along])
+    assert not _goes_around(*corner, own, ending).any()
+    assert _goes_around(*around, own, ending).tolist() == [True, False]
+    assert not _goes_around(*around, own + 1, ending).any()
+    assert not _goes_around(*around, own - 1, ending).any()
 
 
 def test_nothing_is_laid_aslant_by_its_border_alone() -> None:
