@@ -57,7 +57,7 @@ from pipelines.stage import StageContext
 
 REDUCE_SHARE = 0.86
 """Of the export's progress, when the shape is done."""
-_RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE = 0.5, 0.53, 0.65
+_RENDER_SHARE, _AFFORD_SHARE, _FUSE_SHARE, _SMOOTH_SHARE = 0.5, 0.53, 0.65, 0.68
 _MEND_SHARE, _CLOSED_SHARE, _OTHERS_SHARE = 0.78, 0.79, 0.793
 _FREE_SHARE, _CARVED_SHARE, _REFINE_SHARE = 0.797, 0.8, 0.83
 _CLEARING = "clearing what is empty"
@@ -232,9 +232,11 @@ def _on_the_photos(
     ctx: StageContext,
 ) -> TriangleMesh:
     """The mesh moved onto what the training photos agree on, without the noise of its voxels."""
-    told = ctx.told_part("refining", _FUSE_SHARE, _MEND_SHARE)
+    begun = _FUSE_SHARE
     if method == "tsdf":
-        mesh = denoised(mesh, lambda done: told(0.0))
+        begun = _SMOOTH_SHARE
+        mesh = denoised(mesh, ctx.told_part("smoothing", _FUSE_SHARE, begun))
+    told = ctx.told_part("refining", begun, _MEND_SHARE)
     return refined(
         mesh,
         _photos(stereo_view, scene, ctx, told),

@@ -189,7 +189,8 @@ class MixedStudio:
             field = as_array(self._scene.render(full, pose, side).rgb)
             shown = enlarged(field, full.height, full.width, around=around)
             return within(circle, as_uint8(shown))
-        # Looking colours up on the mesh keeps one core busy: the field is drawn meanwhile.
+        # Looking colours up on the mesh keeps one core busy, and does not hold the interpreter: the
+        # field is drawn meanwhile. (open3d's rays themselves do hold it.)
         with ThreadPoolExecutor(1) as pool:
             seen = pool.submit(self._mesh.view, full, pose)
             field = as_array(self._scene.render(full, pose, side).rgb)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipelines.errors import ExportError
@@ -35,6 +36,30 @@ def test_more_triangles_than_were_asked_for_are_told(caplog: pytest.LogCaptureFi
     assert not caplog.records
     made = done(part, 64)
     assert f"has {len(made.mesh.faces)} triangles, and not the 64" in caplog.text
+
+
+@pytest.mark.parametrize(("method", "is_smoothed"), [("tsdf", True), ("poisson", False)])
+def test_only_what_is_fused_in_voxels_loses_its_tremble(
+    method: Any, is_smoothed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Poisson's surface is smooth as it is."""
+    trembling = ball(_FAR, 1.0, 24)
+    rng = np.random.default_rng(4)
+    trembling.vertices[:] += 0.01 * rng.standard_normal(trembling.vertices.shape)
+    told: list[tuple[str, float]] = []
+
+    class Context(_Context):
+        def told_part(self, message: str, begin: float, end: float) -> Any:
+            return lambda done: told.append((message, begin + (end - begin) * done))
+
+    monkeypatch.setattr(mesh_shape, "_photos", lambda *_: [])  # nothing is there to refine by
+    given: Any = method, None, [], MeshOptions(flatten=False), Context()
+    moved = np.linalg.norm(
+        mesh_shape._on_the_photos(trembling, *given).vertices - trembling.vertices, axis=1
+    )
+    assert (np.median(moved) > 0.003) == is_smoothed
+    assert ("smoothing" in {message for message, _ in told}) == is_smoothed
+    assert [share for _, share in told] == sorted(share for _, share in told)
 
 
 def test_a_mesh_that_vanishes_is_an_error_that_says_what_to_do(

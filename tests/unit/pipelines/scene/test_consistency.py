@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from pipelines.scene import consistency
 from pipelines.scene.consistency import consistent
 from pipelines.scene.depth_views import DepthView, Pinhole
 from tests.unit.pipelines.scene.synthetic_views import ring, sphere_view
@@ -26,3 +28,18 @@ def test_points_that_views_look_through_are_dropped() -> None:
     assert not fine[len(surface) : len(surface) + 2].any()
     assert fine[-1], "what no view can see is not contradicted"
     assert fine[: len(surface)].mean() > 0.9
+
+
+def test_several_threads_say_what_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Verdicts of all views are counted, in whatever order they come."""
+    rng = np.random.default_rng(2)
+    views = [sphere_view(LENS, pose, CENTER) for pose in ring(24, CENTER)]
+    points = np.concatenate(
+        [CENTER + rng.normal(0.0, 0.7, (4000, 3)), *(v.points()[v.smooth_mask()] for v in views)]
+    )
+    answers = []
+    for threads in (1, 2, 5):
+        monkeypatch.setattr(consistency, "_MOST_THREADS", threads)
+        answers.append(consistent(points, views))
+    assert 0.0 < answers[0].mean() < 1.0
+    assert all(np.array_equal(answers[0], other) for other in answers[1:])
