@@ -75,8 +75,8 @@ _LEAST_SPREAD_DEG, _LEAST_OF_ENDS_DEG = 1.0, 0.5
 """From how far apart cameras see a wall's foot; the latter where about nothing is known behind."""
 _BEHIND = 0.02
 _MOST_BEHIND, _BEHIND_OF_WALL = 0.01, 0.3
-"""Of what is known, behind a wall that it ends at; or of what lies on the wall: what gleams on it,
-or is seen in a glass, seems to be behind."""
+"""Of what is known, behind a wall that it ends at; or of what lies on the wall, unless it is a
+surface: what gleams on a wall, or is seen in a glass, seems to be behind."""
 _BEYOND, _MOST_BEYOND, _MOST_PLACES = 0.06, 0.2, 200
 """No more of the floor so far beyond a wall's foot, by its depth, may be known, of what views could
 see of it."""
@@ -133,7 +133,7 @@ def stood_up(
     levels = np.abs(levels_of(up, planes))
     centers = np.stack([view.center for view in views])
     ends = [
-        level <= _UPRIGHT and _ends_all(plane, centers, points, depths)
+        level <= _UPRIGHT and _ends_all(plane, centers, points, depths, planes)
         for plane, level in zip(planes, levels, strict=True)
     ]
     has_tops = config.hanging_fronts and bool((levels >= LEVEL).any())
@@ -239,24 +239,30 @@ def _find_walls(
             along = np.cross(normal, facing)
             apart = spread_deg(centers[seen_by] - places[on_it[0]], along)
             if apart >= _LEAST_SPREAD_DEG or (
-                apart >= _LEAST_OF_ENDS_DEG and _ends_all(plane, centers, points, depths)
+                apart >= _LEAST_OF_ENDS_DEG and _ends_all(plane, centers, points, depths, planes)
             ):
                 some = on_it[:: max(1, len(on_it) // _MOST_PLACES)]
                 walls.append(_Wall(plane, floor, places[some], far[some]))
     return walls
 
 
-def _ends_all(plane: Floats, centers: Floats, points: Floats, depths: Floats) -> bool:
+def _ends_all(
+    plane: Floats, centers: Floats, points: Floats, depths: Floats, planes: Floats
+) -> bool:
     """Whether hardly anything is known behind an upright plane with cameras on one side alone.
 
-    points: [N, 3], samples of what is known, with their depths [N].
+    points: [N, 3], samples of what is known, with their depths [N]. planes: [P, 4], those known.
     """
     if _share_behind(centers, plane) > _BEHIND:
         return False
     side = np.sign(np.median(centers @ plane[:3] - plane[3]))
     before = side * (points @ plane[:3] - plane[3]) / depths
-    behind, on_it = before < -2.0 * ON_PLANE, np.abs(before) < ON_PLANE
-    return float(behind.mean()) <= max(_MOST_BEHIND, _BEHIND_OF_WALL * float(on_it.mean()))
+    behind, on_it = before < -2.0 * ON_PLANE, float((np.abs(before) < ON_PLANE).mean())
+    if float(behind.mean()) > max(_MOST_BEHIND, _BEHIND_OF_WALL * on_it):
+        return False
+    away = np.abs(points[behind] @ planes[:, :3].T - planes[:, 3]) / depths[behind, None]
+    on_surface = (away < ON_PLANE).any(axis=1)
+    return float(on_surface.sum()) <= _MOST_BEHIND * len(points)
 
 
 def _share_behind(centers: Floats, plane: Floats) -> float:

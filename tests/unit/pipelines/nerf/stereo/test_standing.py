@@ -242,6 +242,24 @@ def test_a_surface_with_much_behind_it_is_no_wall_that_goes_on() -> None:
         assert np.array_equal(before.z, after.z)
 
 
+def test_a_front_with_another_surface_behind_it_is_no_wall_that_goes_on() -> None:
+    """As what is seen beside a fridge, little as it may be: where else than there is its wall."""
+    seen = before_a_wall()
+    maps, without = [], []
+    for one in seen:
+        picture = one.view.picture < 0.8
+        without.append(known_of(one, picture))
+        farther = (6.0 - one.view.center[2]) / (WALL - one.view.center[2])
+        beside = np.zeros_like(picture)
+        beside[:, -8:] = True
+        z = np.where(picture, one.depth, np.where(beside, farther * one.depth, 0.0))
+        maps.append(DepthMap(z.astype(np.float32), np.where(z > 0, 4, 0).astype(np.uint8)))
+    pairs = zip(without, stood_without_floor(seen, without), strict=True)
+    assert all((after.z > before.z).any() for before, after in pairs)
+    for before, after in zip(maps, stood_without_floor(seen, maps), strict=True):
+        assert np.array_equal(before.z, after.z)
+
+
 def test_what_hangs_free_before_a_known_wall_is_not_laid_on_it() -> None:
     """The wall is all around the blank board, which reaches no rim of the pictures."""
     seen = before_a_wall(box=(3.4, 0.3))
