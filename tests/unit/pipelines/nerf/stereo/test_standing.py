@@ -231,6 +231,20 @@ def test_a_blank_wall_goes_on_around_what_hangs_on_it() -> None:
         assert (after.votes[there] >= 1).all()
 
 
+def test_a_wall_without_a_floor_is_handed_on_to_who_knows_nothing_of_it() -> None:
+    seen = before_a_wall()
+    pictures = [one.view.picture < 0.8 for one in seen]
+    maps = [
+        known_of(one, picture & (number < 6))
+        for number, (one, picture) in enumerate(zip(seen, pictures, strict=True))
+    ]
+    found = stood_without_floor(seen, maps)
+    for one, picture, after in zip(seen[6:], pictures[6:], found[6:], strict=True):
+        there = after.z > 0
+        assert there[~picture].mean() > 0.8
+        assert np.abs(after.z[there] / one.depth[there] - 1.0).max() < 0.02
+
+
 def test_a_surface_with_much_behind_it_is_no_wall_that_goes_on() -> None:
     """As the front of a cupboard, which ends somewhere."""
     seen = before_a_wall()
