@@ -189,8 +189,8 @@ class MixedStudio:
             field = as_array(self._scene.render(full, pose, side).rgb)
             shown = enlarged(field, full.height, full.width, around=around)
             return within(circle, as_uint8(shown))
-        # Looking colours up on the mesh keeps one core busy, and does not hold the interpreter: the
-        # field is drawn meanwhile. (open3d's rays themselves do hold it.)
+        # Side by side they take a twelfth less than one after the other: not half, as open3d's rays
+        # hold the interpreter.
         with ThreadPoolExecutor(1) as pool:
             seen = pool.submit(self._mesh.view, full, pose)
             field = as_array(self._scene.render(full, pose, side).rgb)

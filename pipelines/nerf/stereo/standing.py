@@ -132,12 +132,15 @@ def stood_up(
     floors = floors_of(up, planes, points, depths)
     levels = np.abs(levels_of(up, planes))
     centers = np.stack([view.center for view in views])
-    ends = [
-        level <= _UPRIGHT and _ends_all(plane, centers, points, depths, planes)
-        for plane, level in zip(planes, levels, strict=True)
-    ]
+    ends = np.array(
+        [
+            level <= _UPRIGHT and _ends_all(plane, centers, points, depths, planes)
+            for plane, level in zip(planes, levels, strict=True)
+        ],
+        np.bool_,
+    )
     has_tops = config.hanging_fronts and bool((levels >= LEVEL).any())
-    if not (floors or has_tops or any(ends)):
+    if not (floors or has_tops or ends.any()):
         return maps
 
     def look(index: int) -> Look:
@@ -158,15 +161,16 @@ def stood_up(
         known = planes, points, depths
         on_edge = partial(on_progress, _LOOK_SHARE, _MESSAGE)
         fronts = find_fronts(looks, depths_of(maps), up, *known, on_edge)
-    if not (walls or fronts or any(ends)):
+    if not (walls or fronts or ends.any()):
         return maps
     every, stands_on = _with_walls(planes, walls, float(np.median(depths)))
-    ending = np.pad(np.array(ends, np.bool_), (0, len(every) - len(ends)))
+    ending = np.pad(ends, (0, len(every) - len(ends)))
+    handed_on = ending | (np.array(stands_on) >= 0)
     filled = shelves.scratch("on walls", len(views))
 
     def lay(index: int) -> None:
         z = maps[index].z
-        laid = _laid(looks[index], z, every, stands_on, ending) if walls or any(ends) else z
+        laid = _laid(looks[index], z, every, stands_on, ending) if handed_on.any() else z
         filled[index] = laid_on_fronts(looks[index], laid, fronts, planes[floors])
 
     for index, _ in enumerate(each_ahead(lay, range(len(views)))):
@@ -187,7 +191,6 @@ def stood_up(
         MapShelf.kept(shelves, "walls", len(views), fresh=True),
         lambda index: looks[index].patches,
     )
-    handed_on = ending | (np.array(stands_on) >= 0)
     if not handed_on.any():  # of a front nobody else learns: it has ends
         return laid
     return spread(

@@ -207,9 +207,9 @@ def before_a_wall(box: tuple[float, float] | None = None) -> list[Seen]:
     return [look(place, hung=HUNG, box=box) for place in places]
 
 
-def known_of(one: Seen, where: np.ndarray, factor: float = 1.0) -> DepthMap:
-    """A view of which its true depth times a factor is known there [H, W], and nothing else."""
-    z = np.where(where, factor * one.depth, 0.0).astype(np.float32)
+def known_of(one: Seen, where: np.ndarray) -> DepthMap:
+    """A view of which its true depth is known there [H, W], and nothing else."""
+    z = np.where(where, one.depth, 0.0).astype(np.float32)
     return DepthMap(z, np.where(where, 4, 0).astype(np.uint8))
 
 
